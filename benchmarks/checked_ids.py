@@ -150,12 +150,12 @@ class Study:
 def fit(studies: Sequence[Study]) -> GivenScores:
     """The numbers of greatest likelihood."""
     features, is_right = (np.concatenate(each) for each in zip(*map(mask_samples, studies), strict=True))
-    fitted = GivenScores(shows=regress(features, is_right), price=GIVEN.price)
+    fitted = GivenScores(shows=regress(GIVEN.shows, features, is_right), price=GIVEN.price)
     gains = np.array([sample for each in studies for sample in leaf_samples(each, fitted)]).reshape(-1, 2)
     if not 0 < gains[:, 1].sum() < len(gains):
         return fitted
-    constant, slope = regress(np.column_stack((np.ones(len(gains)), gains[:, 0])), gains[:, 1])
-    return replace(fitted, price=round(-constant / slope, 1))
+    weights = regress(("always", "gain"), np.column_stack((np.ones(len(gains)), gains[:, 0])), gains[:, 1])
+    return replace(fitted, price=round(-weights["always"] / weights["gain"], 1))
 
 
 def mask_samples(each: Study) -> tuple[np.ndarray, np.ndarray]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -123,8 +124,8 @@ def main_leaf(leaves: np.ndarray) -> int:
     return int(names[counts.argmax()]) if counts.max() >= SHOWS * len(leaves) else -1
 
 
-def regress(features: np.ndarray, is_right: np.ndarray) -> tuple[float, ...]:
-    """Newton's method; the constant is free."""
+def regress(names: Iterable[str], features: np.ndarray, is_right: np.ndarray) -> dict[str, float]:
+    """The weights of these features, by Newton's method; the constant is free."""
     b, ridge = np.zeros(features.shape[1]), RIDGE * np.eye(features.shape[1])
     ridge[0, 0] = 1e-6
     for _ in range(60):
@@ -132,7 +133,7 @@ def regress(features: np.ndarray, is_right: np.ndarray) -> tuple[float, ...]:
         slope = features.T @ (is_right - p) - ridge @ b
         step = np.linalg.solve((features.T * (p * (1 - p))) @ features + ridge, slope)
         b += step * min(1, 5 / max(np.abs(step).max(), 1e-9))
-    return tuple(b.round(3).tolist())
+    return dict(zip(names, b.round(3).tolist(), strict=True))
 
 
 def fit(studies: list[Study]) -> LeafScores:
@@ -152,10 +153,10 @@ def fit(studies: list[Study]) -> LeafScores:
                     leaves[has_surface][0].append(features)
                     leaves[has_surface][1].append(is_right)
         fitted = LeafScores(
-            shows=regress(np.concatenate(shows[0]), np.concatenate(shows[1])),
-            matched=regress(np.concatenate(matched[0]), np.concatenate(matched[1])),
-            leaf=regress(np.array(leaves[True][0]), np.array(leaves[True][1])),
-            found=regress(np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
+            shows=regress(FITTED.shows, np.concatenate(shows[0]), np.concatenate(shows[1])),
+            matched=regress(FITTED.matched, np.concatenate(matched[0]), np.concatenate(matched[1])),
+            leaf=regress(FITTED.leaf, np.array(leaves[True][0]), np.array(leaves[True][1])),
+            found=regress(FITTED.found, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
         )
     return fitted
 

@@ -42,7 +42,7 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.nview.match_nview import find_clusters
-from mvseg.matching.nview.match_scores import collect_evidence, scene_features
+from mvseg.matching.nview.match_scores import SCENE, collect_evidence, scene_features
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -66,7 +66,7 @@ class Outcome:
         is_warned: whether `match_regions` says that the views hardly agree.
         scores: (N,) of the matched regions that show a leaf.
         is_right: (N,) bool.
-        features: (N, 4), see `scene_features`; None where they were not asked for.
+        features: (N, 5), see `scene_features`; None where they were not asked for.
     """
 
     kind: str
@@ -131,7 +131,7 @@ def judge(regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault
 
 
 def clusters_and_features(regions: Regions, cameras: Cameras) -> tuple[Tensor, NDArray[np.floating]]:
-    """(D,) int64 ids, -1 for regions alone, and (D, 4) `scene_features`; the regions are ordered by view."""
+    """(D,) int64 ids, -1 for regions alone, and (D, 5) `scene_features`; the regions are ordered by view."""
     affinity = region_affinity(regions, cameras)
     found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions))
     evidence = collect_evidence(found.scores, found.clusters, found.pairwise)
@@ -139,9 +139,8 @@ def clusters_and_features(regions: Regions, cameras: Cameras) -> tuple[Tensor, N
 
 
 def fit(outcomes: list[Outcome]) -> NDArray[np.float64]:
-    """(5,) the intercept and coefficients of largest likelihood, every region alike."""
+    """(5,) weights of largest likelihood, every region alike."""
     X = np.concatenate([each.features for each in outcomes if each.features is not None])
-    X = np.concatenate((np.ones((len(X), 1)), X), 1)
     sign = 2 * np.concatenate([each.is_right for each in outcomes]) - 1.0
 
     def loss(w: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
@@ -211,7 +210,7 @@ def main() -> None:
     specs = [spec for spec in chosen_scenes(args) if spec.num_leaves * spec.num_views <= args.most_masks]
     outcomes = [each for of_scene in run_all(work, specs, args.workers) for each in of_scene]
     if args.fit:
-        print("SCENE_COEFFICIENTS =", tuple(np.round(fit(outcomes), 3).tolist()))
+        print("SCENE =", dict(zip(SCENE, fit(outcomes).round(3).tolist(), strict=True)))
         return
     print_scores(outcomes)
     print_groups(outcomes)

@@ -27,7 +27,7 @@ from benchmarks.straps import cut_pieces, strap_cameras
 from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.match_nview import find_clusters
-from mvseg.matching.nview.pieces import piece_features
+from mvseg.matching.nview.pieces import PIECE, piece_features
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -79,10 +79,11 @@ def judge(
 
 
 def fit(features: np.ndarray, is_right: np.ndarray) -> np.ndarray:
-    """Coefficients of greatest likelihood, the intercept first."""
-    columns, sign = np.column_stack((np.ones(len(features)), features)), np.where(is_right, 1, -1)
+    """Weights of greatest likelihood, that of the constant first."""
+    sign = np.where(is_right, 1, -1)
     return minimize(
-        lambda b: np.logaddexp(0, -sign * (columns @ b)).sum() + RIDGE * (b[1:] ** 2).sum(), np.zeros(columns.shape[1])
+        lambda b: np.logaddexp(0, -sign * (features @ b)).sum() + RIDGE * (b[1:] ** 2).sum(),
+        np.zeros(features.shape[1]),
     ).x
 
 
@@ -110,10 +111,10 @@ def main() -> None:
     for plant in np.unique(plant_of):
         own = plant_of == plant
         b = fit(features[~own], is_right[~own])
-        chance[own] = expit(b[0] + features[own] @ b[1:])
+        chance[own] = expit(features[own] @ b)
     print(f"{len(features)} pieces, {is_right.sum()} right: of these stay {(chance[is_right] >= 0.5).mean():.3f}, "
           f"of the others {(chance[~is_right] >= 0.5).mean():.3f}")  # fmt: skip
-    print("COEFFICIENTS =", tuple(round(each, 2) for each in fit(features, is_right).tolist()))
+    print("PIECE =", dict(zip(PIECE, fit(features, is_right).round(2).tolist(), strict=True)))
 
 
 if __name__ == "__main__":

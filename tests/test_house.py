@@ -172,9 +172,9 @@ def test_warnings_are_given_by_one_function() -> None:
     assert by_hand == {"mvseg.errors"}
 
 
-# Rooms whose numbers stand in their `numbers.py`, and modules of them that still have theirs.
-NUMBERED = {"checks", "corrections", "detection", "matching", "reconstruction", "tracking", "verification"}
-BESIDE = {"mvseg.checks.camera_plan", "mvseg.verification.leaf_scores", "mvseg.reconstruction.surface.leaf_surface"}
+# Rooms whose numbers stand in their `numbers.py`; and modules of them with what a file format or a drawing defines.
+NUMBERED = {room_of(module) for module in MODULES if module.endswith(".numbers")}
+BESIDE = {"mvseg.checks.camera_plan"}
 
 
 def numbers_at_the_head(source: str) -> set[str]:

@@ -108,6 +108,7 @@ class FitNumbers:
     narrow: float = 0.15  # width of half a leaf that limits steps, as a share of its length, at least
     noisy_view: float = 1.5  # deviation of a view's distances from which it counts less, in the usual one
     sd_factor: float = 2.0  # factor of deviations
+    difference: float = 1e-4  # limit: move of a coefficient for a derivative, as a share of the spread of all
     quiet_px: float = 0.3  # root mean square distance above which the factor is larger
     # Where masks are clean, little is measured.
     centre_factor: float = 1.5  # deviation of what all masks may be too large by, in the measured one
@@ -167,6 +168,7 @@ class DoubtNumbers:
     """When a surface is doubted."""
 
     least_iou: float = 0.8  # median IoU below which it is
+    credible_iou: float = 0.7  # median IoU from which its measures are given at all: buds, fruit and stems have less
     most_area_share: float = 0.1  # deviation of its area, as a share of it, above which it is
     # A deep cup that most views look into shows in one view what it is; ovate leaves lack 0.02 at most.
     clean_iou: float = 0.95  # median IoU above which it is doubted if it lacks too much of a single mask

@@ -24,7 +24,7 @@ from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN
 
-GUESS = (-0.79, 0.62, 1.48)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
+GUESS = (-0.79, 0.62, 1.48)  # offset, own and strange gain of `guess_chance`; `python benchmarks/fit_chances.py`
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,20 +54,20 @@ class Habit:
         still: probability, before anything is known of a pair of dates.
     """
 
-    still: float = 5 / 6
+    still: float = ALIGN.still
 
     @staticmethod
     def of(found: Sequence[Alignment], pots: Pots) -> Habit:
         """From alignments of a plant's dates; each counts as much as it is known."""
         if pots != "auto":
             return Habit(1.0 if pots == "fixed" else 0.0)
-        start = Habit().still
-        return Habit((6 * start + sum(each.still for each in found)) / (6 + len(found)))
+        known = ALIGN.prior_pairs * ALIGN.still + sum(each.still for each in found)
+        return Habit(known / (ALIGN.prior_pairs + len(found)))
 
     @property
     def world_prior(self) -> float:
         """Log of how much likelier than any other pose it is that the frames agree."""
-        least = 1e-6
+        least = ALIGN.least_still
         return math.log(max(self.still, least) / max((1 - self.still) / ALIGN.turns, least))
 
 
@@ -192,7 +192,7 @@ def draw_poses(pair: Pair) -> Floats:
     first, second = pair.first, pair.second
     one, other = np.repeat(np.arange(len(first)), len(second)), np.tile(np.arange(len(second)), len(first))
     ratio = np.abs(np.log(second.lengths[other] / first.lengths[one]))
-    one, other = one[ratio < 1.2], other[ratio < 1.2]
+    one, other = one[ratio < ALIGN.alike_length], other[ratio < ALIGN.alike_length]
     poses = [np.zeros((0, 4, 4))]
     for ends in ((0, -1), (-1, 0)):  # the later midrib as it is, and from its other end where its base is not known
         keep = np.ones(len(one), bool) if ends[0] == 0 else ~(first.is_oriented[one] & second.is_oriented[other])

@@ -29,6 +29,10 @@ class SightNumbers:
 class AlignNumbers:
     """The pose of a plant on one date in the world of another."""
 
+    still: float = 5 / 6  # probability that a pot stands as it stood, before its plant is known
+    prior_pairs: int = 6  # pairs of dates that say as much as this does
+    least_still: float = 1e-6  # limit: probability of either answer, at least, so that its logarithm is a number
+    alike_length: float = 1.2  # difference of the log lengths of two leaves that suggest a pose, at most
     num_refined: int = 20  # poses of two dates that are refined: those that look best
     upright: float = 2.0  # weight of the direction of up where a pose is fitted, in leaves
     tip: float = 0.43  # weight of the tip of a leaf there, where base and middle have 1, for tips sway

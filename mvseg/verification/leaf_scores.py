@@ -15,33 +15,31 @@ from scipy.special import expit, logit
 
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.verification.evidence import Bools, Evidence, Floats, Ints
-
-EPS = 0.01  # log odds are those of the nearest value that is at least so far from 0 and 1, where they are infinite
-CLEAR = 0.6  # a candidate is a clear leaf if the views show at least this fraction of what they must show of it
+from mvseg.verification.numbers import CHOICE
 
 
 @dataclass(frozen=True)
 class LeafScores:
-    """Log odds are the first number plus the others times the features.
+    """Log odds are the sum of the features times their weights, which are in the order of the features.
 
     Attributes:
         shows: of a mask, to show a candidate with a surface: see `shows_features`.
         matched: the same of one without: see `matched_features`.
         leaf: of a candidate with a surface, to be a leaf: see `leaf_features`.
-        found: the same of one without; the first four features only.
+        found: the same of one without, by the first four of these features.
     """
 
-    shows: tuple[float, ...]
-    matched: tuple[float, ...]
-    leaf: tuple[float, ...]
-    found: tuple[float, ...]
+    shows: dict[str, float]
+    matched: dict[str, float]
+    leaf: dict[str, float]
+    found: dict[str, float]
 
 
 FITTED = LeafScores(
-    shows=(0.656, 0.314, 1.431, 0.665),
-    matched=(-1.632, 0.958, 0.897),
-    leaf=(-2.385, 4.382, 0.913, 1.153, 1.157, 0.387),
-    found=(-0.732, 1.986, 1.290, 0.928),
+    shows={"always": 0.656, "detection score": 0.314, "claimed": 1.431, "visible": 0.665},
+    matched={"always": -1.632, "detection score": 0.958, "match score": 0.897},
+    leaf={"always": -2.385, "shown": 4.382, "number": 0.913, "detection score": 1.153, "length": 1.157, "fit": 0.387},
+    found={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
 )
 
 
@@ -105,11 +103,11 @@ class ClearLeaves:
 def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
     masks that were matched to a candidate can; what a person says is certain."""
-    q = expit(matched_features(candidates.matched, scores) @ np.array(fitted.matched))
+    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
     q = np.where(np.isnan(candidates.matched), 0.0, q)
     with_surface = candidates.has_surface
     if with_surface.any():
-        by_surface = expit(shows_features(evidence, scores) @ np.array(fitted.shows)) * (evidence.claimed > 0)
+        by_surface = expit(shows_features(evidence, scores) @ list(fitted.shows.values())) * (evidence.claimed > 0)
         q = np.where(with_surface, by_surface, q)
     q[candidates.certain.any(1)] = 0
     q[candidates.certain] = 1
@@ -130,8 +128,8 @@ def matched_features(matched: Floats, scores: Floats) -> Floats:
 
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(K,) P: how likely each candidate is a leaf; 1 where a person says so."""
-    by_surface = expit(features @ np.array(fitted.leaf))
-    by_masks = expit(features[:, : len(fitted.found)] @ np.array(fitted.found))
+    by_surface = expit(features @ list(fitted.leaf.values()))
+    by_masks = expit(features[:, : len(fitted.found)] @ list(fitted.found.values()))
     chances: Floats = np.where(candidates.has_surface, by_surface, by_masks)
     return np.where(candidates.is_certain, 1.0, chances)
 
@@ -155,7 +153,7 @@ def leaf_features(
     number, lengths = best.sum(0), candidates.lengths
     score = (best * sure).sum(0) / np.maximum(number, 1e-9)
     if clear is None:
-        is_clear = shown >= min(CLEAR, shown.max(initial=0))
+        is_clear = shown >= min(CHOICE.clear, shown.max(initial=0))
         known = lengths[is_clear & candidates.has_surface]
         clear = ClearLeaves(float(np.median(score[is_clear])), float(np.median(known)) if len(known) else 1.0)
     relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
@@ -177,5 +175,6 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
 
 def log_odds(values: Floats) -> Floats:
     """Of shares and scores; NaN, of a mask that no detector scored, counts as one half."""
-    odds: Floats = logit(np.clip(np.nan_to_num(values, nan=0.5), EPS, 1 - EPS))
+    least = CHOICE.least_distance
+    odds: Floats = logit(np.clip(np.nan_to_num(values, nan=0.5), least, 1 - least))
     return odds

@@ -62,6 +62,8 @@ class ChoiceNumbers:
 
     rounds: int = 2  # in the first nothing hides anything, in the second the leaves of the first do
     same: float = 0.8  # Jaccard index of the masks of two candidates, by area, above which they are one
+    clear: float = 0.6  # share of what views must show of a candidate from which it is a clear leaf
+    least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
     least_shown: float = 0.2  # q from which a mask may show a leaf
     least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor

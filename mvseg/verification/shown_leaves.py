@@ -31,17 +31,21 @@ class GivenScores:
     """`python -m benchmarks.checked_ids --fit` fits them.
 
     Attributes:
-        shows: log odds that a mask shows a candidate are the sum of these times `shows_features`.
+        shows: log odds that a mask shows a candidate are the sum of `shows_features` times these, in their order.
         price: log odds that masks must gain in all by a leaf that the first matching does not know.
     """
 
-    shows: tuple[float, ...]
+    shows: dict[str, float]
     price: float
 
 
 # Any price from 1.5 to 14.5 gives the dense basil the same ids; --fit says 3.0 with these numbers. It stays at what the
 # first fit said: a right mask that is lost is worse than one that is not won.
-GIVEN = GivenScores(shows=(1.962, 0.359, -1.66, 1.214, 0.764, 1.007, 0.866), price=6.1)
+GIVEN = GivenScores(
+    shows={"surface": 1.962, "match score": 0.359, "matched to another": -1.66, "visible": 1.214, "within": 0.764,
+           "no surface": 1.007, "match score without": 0.866},
+    price=6.1,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
     """
     candidates, masks = question.candidates, question.masks
     evidence = see(question.drawn, len(masks), question.is_known & candidates.is_credible)
-    odds = np.round(shows_features(candidates, evidence) @ np.array(fitted.shows), CHOICE.digits)
+    odds = np.round(shows_features(candidates, evidence) @ list(fitted.shows.values()), CHOICE.digits)
     is_near = ~np.isnan(candidates.matched) | (candidates.is_credible & (evidence.claimed > 0))
     odds[~is_near | ~same_class(candidates, masks)] = -np.inf
     odds[candidates.certain.any(1)] = -np.inf

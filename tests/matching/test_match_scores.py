@@ -34,9 +34,9 @@ def test_a_close_rival_means_doubt() -> None:
 
 
 def test_by_hand_and_limited_to_what_the_plants_fill() -> None:
-    assert features(evidence())[0].tolist() == [0.8, 0.9, 0.9, 0.8, 1.0, 0.25, 0.0]
+    assert features(evidence())[0].tolist() == [1, 0.8, 0.9, 0.9, 0.8, 1.0, 0.25, 0.0]
     far = features(evidence(score=-3, margin=9, coverage=2, weight=-1, num_partners=9, num_fragments=3))[0]
-    assert far.tolist() == pytest.approx([-0.2, 1.5, 1, 0, 1, 1 / 9, 1])
+    assert far.tolist() == pytest.approx([1, -0.2, 1.5, 1, 0, 1, 1 / 9, 1])
 
 
 def join(*regions: IdEvidence) -> IdEvidence:
@@ -65,7 +65,7 @@ def test_another_answer_from_the_weights_alone_means_doubt() -> None:
 def test_the_scene_by_hand() -> None:
     first = scene_features(evidence())[0]
     odds = np.exp(1.24 + 1.20 * 0.8 + 2.96 * 0.9 - 0.69 * 0.9 + 1.26 * 0.8 - 0.90 - 1.59 / 4)
-    assert first.tolist() == pytest.approx([np.log(odds), np.log(odds), np.log(odds) ** 2, 1.0])
+    assert first.tolist() == pytest.approx([1, np.log(odds), np.log(odds), np.log(odds) ** 2, 1.0])
     pair = scene_features(join(evidence(), evidence(num_partners=1, agreement=0.5)))
-    np.testing.assert_allclose(pair[:, 2], pair[:, 0] * pair[0, 1])
-    np.testing.assert_allclose(pair[:, 3], 0.75)
+    np.testing.assert_allclose(pair[:, 3], pair[:, 1] * pair[0, 2])
+    np.testing.assert_allclose(pair[:, 4], 0.75)

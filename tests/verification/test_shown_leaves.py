@@ -104,7 +104,7 @@ def test_log_odds_are_those_of_features_counted_on_whole_frames() -> None:
     assert np.isneginf(of_two_classes[(ids == 2).numpy()][:, [0, 2]]).all()
     assert (of_two_classes[:, 1] == np.where(ids == 2, odds[:, 1], -np.inf)).all()
     without = show_odds(question_of(masks, {1: LEAVES[1], 2: LEAVES[2]}))[:, 2]  # of leaf 3, which has no surface
-    assert without[(ids == 3).numpy()] == pytest.approx(np.dot(GIVEN.shows[5:], [1, logit(0.8)]), abs=1e-6)
+    assert without[(ids == 3).numpy()] == pytest.approx(np.dot([*GIVEN.shows.values()][5:], [1, logit(0.8)]), abs=1e-6)
     assert np.isneginf(without[(ids != 3).numpy()]).all()
     for row in range(0, len(ids), 3):
         view = int(regions.view_index[row])
@@ -117,7 +117,7 @@ def test_log_odds_are_those_of_features_counted_on_whole_frames() -> None:
             shares = [(mask & seen).sum() / (mask | seen).sum(), (mask & whole).sum() / mask.sum()]
             is_own = leaf == int(ids[row])
             features = [1, logit(0.8) * is_own, not is_own, *logit(np.clip(shares, 0.01, 0.99))]
-            assert odds[row, column] == pytest.approx(np.dot(GIVEN.shows[:5], features), abs=1e-6)
+            assert odds[row, column] == pytest.approx(np.dot([*GIVEN.shows.values()][:5], features), abs=1e-6)
 
 
 def test_of_two_masks_with_the_same_pixels_one_stays() -> None:

@@ -23,10 +23,10 @@ from mvseg.matching.partition import Clusters
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
-# Intercept, then one for each column of `features`.
-COEFFICIENTS = (1.24, 1.20, 2.96, -0.69, 1.26, -0.90, -1.59, -0.95)
-# Intercept, then one for each column of `scene_features`.
-SCENE_COEFFICIENTS = (-2.889, 0.050, 0.303, 0.173, 2.911)
+# Weights of the columns of `features`, in their order, and of those of `scene_features`.
+REGION = {"always": 1.24, "score": 1.20, "margin": 2.96, "coverage": -0.69, "weight": 1.26, "partners": -0.90,
+          "few partners": -1.59, "fragments": -0.95}  # fmt: skip
+SCENE = {"always": -2.889, "region": 0.050, "scene": 0.303, "region times scene": 0.173, "agreement": 2.911}
 SUREST = 0.999, 0.99  # limit: the most that the first regression says of a region, and of a scene
 
 
@@ -92,10 +92,11 @@ def _count_partners(clusters: Ints, view_index: Ints) -> tuple[Ints, Ints]:
 
 
 def features(evidence: IdEvidence) -> Floats:
-    """(D, 7): what the probability depends on, clipped to the range seen on the development plants."""
+    """(D, 8): 1, and what the probability depends on, clipped to the range seen on the development plants."""
     others = max(evidence.num_views - 1, 1)
     return np.stack(
         [
+            np.ones(len(evidence.score)),
             np.clip(evidence.score, -0.2, 1),
             np.clip(evidence.margin, -1, 1.5),
             np.clip(evidence.coverage, 0, 1),
@@ -109,22 +110,22 @@ def features(evidence: IdEvidence) -> Floats:
 
 
 def scene_features(evidence: IdEvidence) -> Floats:
-    """(D, 4): what the region says, what the scene says, their product, and how far the second opinion agrees.
+    """(D, 5): 1, what the region says, what the scene says, their product, and how far the second opinion agrees.
 
-    The first two are log-odds, of the first regression for the region and of its mean over the matched regions.
+    Region and scene say log-odds, of the first regression for the region and of its mean over the matched regions.
     """
-    sure = 1 / (1 + np.exp(-(COEFFICIENTS[0] + features(evidence) @ np.array(COEFFICIENTS[1:]))))
+    sure = 1 / (1 + np.exp(-(features(evidence) @ list(REGION.values()))))
     is_matched = evidence.num_partners > 0
     mean = sure[is_matched].mean() if is_matched.any() else 0.0
     agreement = evidence.agreement[is_matched].mean() if is_matched.any() else 0.0
     region, scene = (_log_odds(x, most) for x, most in zip((sure, mean), SUREST, strict=True))
     ones = np.ones(len(sure))
-    return np.stack([region, scene * ones, region * scene, agreement * ones], 1)
+    return np.stack([ones, region, scene * ones, region * scene, agreement * ones], 1)
 
 
 def match_scores(evidence: IdEvidence) -> Floats:
     """(D,) in [0, 1]: the probability that each id is right; 0 for regions that are alone."""
-    logit = SCENE_COEFFICIENTS[0] + scene_features(evidence) @ np.array(SCENE_COEFFICIENTS[1:])
+    logit = scene_features(evidence) @ list(SCENE.values())
     return np.where(evidence.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)
 
 

@@ -18,7 +18,8 @@ from mvseg.matching.partition import Clusters
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
-COEFFICIENTS = (1.28, 0.84, 3.69, 4.37, -3.93)  # intercept, then one for each column of `piece_features`
+# Weights of the columns of `piece_features`, in their order.
+PIECE = {"always": 1.28, "other pieces": 0.84, "score": 3.69, "coverage": 4.37, "weight": -3.93}
 
 
 def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Floats]:
@@ -30,7 +31,7 @@ def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Fl
     """
     chance = np.ones(len(clusters.ids))
     rows, features = piece_features(scores, clusters)
-    chance[rows] = expit(COEFFICIENTS[0] + features @ np.array(COEFFICIENTS[1:]))
+    chance[rows] = expit(features @ list(PIECE.values()))
     leaves = (chance < PIECES.least) & ~scores.graph.is_joined
     parted = np.where(leaves, len(clusters) + np.arange(len(leaves)), clusters.ids)
     return Clusters.of(parted), np.where(leaves, 1.0, chance)
@@ -40,8 +41,8 @@ def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Flo
     """The P regions that are not the best one of their cluster in their view, by leave-one-out score.
 
     Returns:
-        (P,) int64 rows, and (P, 4) float64: the logarithm of the share of all other places (a cluster in a view) with
-        several regions, of which half a one is counted in any case; the score as a share of the best one's; the share
+        (P,) int64 rows, and (P, 5) float64: 1; the logarithm of the share of all other places (a cluster in a view)
+        that have several regions, half a place counted in any case; the score as a share of the best one's; the share
         of the cluster's pixels in other views that show the region; and its mean epipolar weight to the members there,
         which is low for a piece.
     """
@@ -59,4 +60,4 @@ def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Flo
     coverage = np.clip(scores.coverages(clusters)[clusters.ids[rows], rows], 0, 1) if len(rows) else np.zeros(0)
     partners = np.maximum(scores.graph.sum_partners(np.ones_like(scores.graph.weights), clusters), 1)
     weight = scores.graph.sum_partners(scores.graph.weights, clusters) / partners
-    return rows, np.column_stack((np.full(len(rows), share), ratio, coverage, weight[rows]))
+    return rows, np.column_stack((np.ones(len(rows)), np.full(len(rows), share), ratio, coverage, weight[rows]))

@@ -13,6 +13,7 @@ import trimesh
 from torch import Tensor
 
 from mvseg.crop import Crop
+from mvseg.reconstruction.numbers import DOUBTS, FIT
 from mvseg.reconstruction.surface.leaf_patch import (
     NUM_COEFFICIENTS,
     Floats,
@@ -25,8 +26,6 @@ from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
 MESH_SHAPE = (64, 17)  # a mesh has so many rows and columns of vertices (a definition)
-LEAST_CREDIBLE_IOU = 0.7  # a surface is credible if its median IoU is at least this
-STEP = 1e-4  # a coefficient is moved by this share of the spread of all, for differences (a technical limit)
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ class LeafSurface:
 
         A patch that explains its masks badly is none of a leaf: buds, fruit and stems have no blade.
         """
-        return self.exists and float(self.iou.median()) >= LEAST_CREDIBLE_IOU
+        return self.exists and float(self.iou.median()) >= DOUBTS.credible_iou
 
     def points(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> Tensor:
         """(rows, columns, 3) float64 grid from base to tip and from edge to edge; odd columns have the midrib."""
@@ -138,7 +137,7 @@ class LeafSurface:
             (T,) float64; NaN without a surface, and for numbers that are NaN.
         """
         center = self.coefficients.numpy()
-        step = STEP * float(np.linalg.norm(center.std(axis=0)))
+        step = FIT.difference * float(np.linalg.norm(center.std(axis=0)))
         moves = step * np.eye(center.size).reshape(-1, *center.shape)
         with np.errstate(all="ignore"):
             numbers, *moved = measure(np.concatenate((center[None], center + moves, center - moves)))
