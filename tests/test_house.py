@@ -174,7 +174,7 @@ def test_warnings_are_given_by_one_function() -> None:
 
 # Rooms whose numbers stand in their `numbers.py`; and modules of them with what a file format or a drawing defines.
 NUMBERED = {room_of(module) for module in MODULES if module.endswith(".numbers")}
-BESIDE = {"mvseg.checks.camera_plan"}
+BESIDE = {"mvseg.checks.camera_plan", "mvseg.poses.photo_files"}
 
 
 def numbers_at_the_head(source: str) -> set[str]:

@@ -16,14 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
+from mvseg.poses.numbers import WORLD
 
 Floats = NDArray[np.float64]
 
-FLAT = 0.02  # ratio of spreads, below which points count as collinear (or coplanar)
-MIRRORED = 0.5  # residual of the best reflection over that of the best similarity, below which axes are left-handed
-TRIALS = 300  # random triples of points
-OUTLIER = 3.0  # inliers have residuals up to this times the one that half of the points do not exceed
-ROUNDING = 1e-9  # of the spread of the points: smaller residuals count as 0
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
@@ -63,7 +59,7 @@ def is_one_line(points: Floats) -> bool:
     if len(points) < 3:
         return True
     along, across = spreads(points)[:2]
-    return bool(across <= FLAT * along)
+    return bool(across <= WORLD.flat * along)
 
 
 def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
@@ -99,8 +95,8 @@ def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
 def _refuse_mirror(source: Floats, target: Floats, residuals: list[float]) -> None:
     """Raise InputError if the targets are fitted far better by the mirror image of the sources: `residuals` are of the
     sources and of their image. In one plane both are as good, and small residuals differ by noise."""
-    is_flat = any(off <= FLAT * across for _, across, off in (spreads(source), spreads(target)))
-    if not is_flat and residuals[1] < MIRRORED * residuals[0] and residuals[0] > FLAT * spreads(target)[0]:
+    is_flat = any(off <= WORLD.flat * across for _, across, off in (spreads(source), spreads(target)))
+    if not is_flat and residuals[1] < WORLD.mirrored * residuals[0] and residuals[0] > WORLD.flat * spreads(target)[0]:
         raise InputError("the known points are mirrored, expected right-handed axes: reverse one axis")
 
 
@@ -125,8 +121,8 @@ def align(source: Floats, target: Floats) -> SimilarityFit:
         best = found[0]
         for _ in range(3):
             residuals = _residuals(best, source, target)
-            limit = OUTLIER * (1 + 5 / (len(source) - 3)) * _agreement(residuals)
-            is_inlier = residuals <= max(limit, ROUNDING * spreads(target)[0])
+            limit = WORLD.outlier * (1 + 5 / (len(source) - 3)) * _agreement(residuals)
+            is_inlier = residuals <= max(limit, WORLD.rounding * spreads(target)[0])
             if is_one_line(source[is_inlier]) or is_one_line(target[is_inlier]):
                 is_inlier[:] = True
             best = fit_similarity(source[is_inlier], target[is_inlier])
@@ -145,7 +141,7 @@ def _agreement(residuals: Floats) -> float:
 def _most_agreed(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, float]:
     """The similarity of three points on which just over half of all points agree best, and their agreement."""
     rng = np.random.default_rng(0)
-    triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIALS)]
+    triples = [rng.choice(len(source), 3, replace=False) for _ in range(WORLD.trials)]
     triples = [three for three in triples if not (is_one_line(source[three]) or is_one_line(target[three]))]
     fits = [_fit(source[three], target[three]) for three in triples] or [_fit(source, target)]
     agreements = [_agreement(_residuals(fit, source, target)) for fit in fits]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -17,17 +18,8 @@ from scipy.spatial.transform import Rotation
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.markers import Grey, find_board
-from mvseg.poses.table_fit import HALF, Floats, Sightings, TableCamera, TableFit, fit_table, opencv_matrix
-
-LEAST_PHOTOS = 4
-LEAST_CORNERS = 6  # of a photo
-LEAST_TURN = 10.0  # degrees, of all photos together
-FLAT = 0.7  # cosine between the axis and the normal of a board that lies, more or less, flat
-MOST_RESIDUAL = 0.005  # in widths of the photo, above which the motion was not a pure rotation
-
-ROUGH, FINE = 1e-3, 1e-8  # relative changes of squared residuals, at which the first search ends, and the last
-STARTS = (0.7, 1.4, 2.8)  # focal lengths in longer sides of the photo, from wide phones to short telephoto lenses
-NOISE_PX, LEAST_NOISE_PX = 0.1, 0.02  # of the corners: until it is measured, and the least that is believed
+from mvseg.poses.numbers import TABLE
+from mvseg.poses.table_fit import Floats, Sightings, TableCamera, TableFit, fit_table, opencv_matrix
 
 Seen = dict[int, tuple[np.ndarray, Floats]]  # {place of the angle: numbers and pixels of the corners}
 Poses = dict[int, pycolmap.Rigid3d]  # {place of the angle: cam_from_board}
@@ -80,15 +72,16 @@ def calibrate_turntable(
             raise InputError(f"{where}{message}, expected as many, at the same angles in the same order")
         seen[name] = _find_boards(each, board, where)
     is_given = lens is not None
-    starts = [dict.fromkeys(photos, lens)] if lens else [_middling_lenses(photos, focal) for focal in STARTS]
-    fits = [_fit(seen, board, start, noise_px=NOISE_PX, fix_lenses=is_given, tolerance=ROUGH)[1] for start in starts]
+    starts = [dict.fromkeys(photos, lens)] if lens else [_middling_lenses(photos, focal) for focal in TABLE.starts]
+    start_fit = partial(_fit, seen, board, noise_px=TABLE.noise_px, fix_lenses=is_given, tolerance=TABLE.rough)
+    fits = [start_fit(start)[1] for start in starts]
     rough = min(fits, key=lambda fit: fit.cost)  # from a wrong focal length, side minima are possible
-    if rough.residual_px > MOST_RESIDUAL * max(each.size[0] for each in rough.cameras):
+    if rough.residual_px > TABLE.most_residual * max(each.size[0] for each in rough.cameras):
         message = f"one axis of rotation explains the board to {rough.residual_px:.1f} px only"
         raise InputError(f"{message}: did a camera move, or the board on the table?")
     lenses = dict(zip(photos, rough.cameras, strict=True))
-    noise_px = max(LEAST_NOISE_PX, float(np.sqrt((rough.residuals**2).mean())))
-    used, fit = _fit(seen, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=FINE)
+    noise_px = max(TABLE.least_noise_px, float(np.sqrt((rough.residuals**2).mean())))
+    used, fit = _fit(seen, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=TABLE.fine)
     angles = np.full(num_angles, np.nan)
     angles[used] = fit.angles
     return TurntableCalibration(
@@ -107,10 +100,10 @@ def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> Seen
             given = f"{photo.shape[1]} x {photo.shape[0]} pixels, the first {size[0]} x {size[1]}"
             raise InputError(f"{where}photo {index} has {given}, expected one camera")
     seen = {index: find_board(photo, board) for index, photo in enumerate(photos)}
-    found = {index: each for index, each in seen.items() if len(each[0]) >= LEAST_CORNERS}
-    if len(found) < LEAST_PHOTOS:
-        message = f"{where}{len(found)} of {len(photos)} photos show {LEAST_CORNERS} corners of the board or more"
-        raise InputError(f"{message}, expected at least {LEAST_PHOTOS}: is it {board.columns} x {board.rows}?")
+    found = {index: each for index, each in seen.items() if len(each[0]) >= TABLE.least_corners}
+    if len(found) < TABLE.least_photos:
+        message = f"{where}{len(found)} of {len(photos)} photos show {TABLE.least_corners} corners of the board or more"
+        raise InputError(f"{message}, expected at least {TABLE.least_photos}: is it {board.columns} x {board.rows}?")
     return found
 
 
@@ -161,7 +154,7 @@ def _fit(
 
 def _board_pose(numbers: np.ndarray, px: Floats, board: BoardConfig, lens: TableCamera) -> pycolmap.Rigid3d:
     """cam_from_board of one photo."""
-    _, turn, shift = cv2.solvePnP(board.corners()[numbers], px - HALF, opencv_matrix(lens.K), lens.distortion)
+    _, turn, shift = cv2.solvePnP(board.corners()[numbers], px - 0.5, opencv_matrix(lens.K), lens.distortion)
     return _rigid(Rotation.from_rotvec(np.ravel(turn)), np.ravel(shift))
 
 
@@ -201,11 +194,12 @@ def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict
         cam_from_world, the angles in degrees, and world_from_board.
     """
     direction, point, turns = _find_axis(list(poses.values()))
-    if np.ptp(turns) < LEAST_TURN:
+    if np.ptp(turns) < TABLE.least_turn:
         raise InputError(f"the board turned by {np.ptp(turns):.1f} degrees in all, expected a table that turns")
     cam_from_board = next(iter(poses.values()))
     normal = cam_from_board.rotation.matrix()[:, 2]
-    upwards = normal if abs(normal @ direction) > FLAT else np.array([0.0, -1, 0])  # of a standing board: the camera's
+    is_flat = abs(normal @ direction) > TABLE.flat
+    upwards = normal if is_flat else np.array([0.0, -1, 0])  # of a standing board: the camera's
     if upwards @ direction < 0:
         direction, turns = -direction, -turns
     point = point + ((cam_from_board * middle - point) @ direction) * direction

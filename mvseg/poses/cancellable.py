@@ -9,8 +9,6 @@ from typing import Any, TypeVar
 import pycolmap
 
 Answer = TypeVar("Answer")
-WAIT = 0.1  # seconds until a signal is handled, at the latest
-ERRORS_ONLY = 2  # of COLMAP's log
 
 
 def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> Answer:
@@ -33,10 +31,10 @@ def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> 
             done.set()
 
     thread, loglevel = Thread(target=run), pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(loglevel, ERRORS_ONLY)  # the log is for COLMAP's developers
+    pycolmap.logging.minloglevel = max(loglevel, 2)  # errors only: the log is for COLMAP's developers
     try:
         thread.start()
-        while not done.wait(WAIT):  # not `join`: in Python 3.11 an exception in it takes the thread for ended
+        while not done.wait(0.1):  # seconds; not `join`: in Python 3.11 an exception in it takes the thread for ended
             pass
     finally:  # files that the call still writes are about to be deleted
         token.cancel()

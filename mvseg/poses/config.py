@@ -9,12 +9,11 @@ from typing import Literal
 
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
+from mvseg.poses.numbers import STRUCTURE
 
 Pairs = Literal["exhaustive", "sequential"]
 # Lenses that a rig file can hold.
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
-LEAST_SHARE = 0.6  # of the photos must register, unless min_registered says otherwise
-LEAST = 3  # photos
 
 
 @dataclass(frozen=True)
@@ -47,10 +46,10 @@ class PoseConfig:
     def __post_init__(self) -> None:
         if self.image_size < 64:
             raise InputError(f"image_size is {self.image_size}, expected 64 or more")
-        if self.min_registered is not None and self.min_registered < LEAST:
-            raise InputError(f"min_registered is {self.min_registered}, expected {LEAST} or more")
-        if self.frames < LEAST:
-            raise InputError(f"frames is {self.frames}, expected {LEAST} or more")
+        if self.min_registered is not None and self.min_registered < STRUCTURE.least:
+            raise InputError(f"min_registered is {self.min_registered}, expected {STRUCTURE.least} or more")
+        if self.frames < STRUCTURE.least:
+            raise InputError(f"frames is {self.frames}, expected {STRUCTURE.least} or more")
         if self.calibration is not None and self.shared_camera is False:
             raise InputError("shared_camera is false beside a calibration, expected one of them")
 

@@ -21,15 +21,12 @@ from mvseg.errors import InputError
 from mvseg.formats.image_file import read_rgb
 from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import PoseConfig
+from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, group_by_camera
 from mvseg.poses.sift import coarsest, count_alike, find_sift
 from mvseg.system.running import progress_bar
 
 PHOTOS_AT_ONCE = max(2, os.cpu_count() or 1)  # of one call, after which the progress bar advances
-PAIRS_AT_ONCE = 100  # of one call, which indexes each of its photos once: at 10 matching takes several times as long
-SEED = 0
-QUICK_SIZE = 1600  # pixels of the longer side; a third more takes twice as long
-QUICK_MOST = 4096  # features of a photo, those of most contrast; a third more take half as long again to match
 
 
 def number_photos(images: Path, photos: Sequence[PhotoFile], folder: Path) -> dict[str, PhotoFile]:
@@ -68,17 +65,16 @@ def make_database(
 
 
 def find_features(database: Path, folder: Path, names: Sequence[str], *, image_size: int) -> NDArray[np.int64]:
-    """Find up to QUICK_MOST features in each photo of the database, at QUICK_SIZE or `image_size` pixels if that is
-    less.
+    """Find `STRUCTURE.quick_most` features or fewer in each photo of the database, at `quick_size` pixels or fewer.
 
     Returns:
         (V, V) how alike the photos are, see `count_alike`.
     """
-    coarse = []
+    coarse, size = [], min(image_size, STRUCTURE.quick_size)
     with pycolmap.Database.open(database) as opened:
         number_of = {image.name: image.image_id for image in opened.read_all_images()}
         for name in progress_bar(names, name="features", unit="photo"):
-            sift = find_sift(read_rgb(folder / name), image_size=min(image_size, QUICK_SIZE), most=QUICK_MOST)
+            sift = find_sift(read_rgb(folder / name), image_size=size, most=STRUCTURE.quick_most)
             number = number_of[name]
             opened.write_keypoints(number, np.column_stack([sift.px, sift.scale, sift.angle]))
             bytes_of = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sift.descriptors)
@@ -131,15 +127,15 @@ def match_features(database: Path, names: Sequence[str], pairs: Sequence[tuple[i
     relative pose."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
+    verification.ransac.random_seed = STRUCTURE.seed
     # What stays at its pixels is a backdrop that does not turn with the plant: a third of a photo of it, and all photos
     # register around the wrong thing. Photos without one lose nothing by it.
     verification.filter_stationary_matches = True
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
     with progress_bar(total=len(pairs), name="matching", unit="pair") as bar:
-        for start in range(0, len(pairs), PAIRS_AT_ONCE):
-            some = pairs[start : start + PAIRS_AT_ONCE]
+        for start in range(0, len(pairs), STRUCTURE.pairs_at_once):
+            some = pairs[start : start + STRUCTURE.pairs_at_once]
             listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some), newline="\n")
             run_cancellable(
                 pycolmap.match_image_pairs,

@@ -9,9 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-SURE = 0.01  # of the focal length: what a larger deviation does to heights shows beside what outlines do
-
-OFF_MIDDLE = 0.01  # of the photo's longer side: what principal points of phones, cameras and webcams are usually off
+from mvseg.poses.numbers import TABLE
 
 
 @dataclass(frozen=True)
@@ -27,8 +25,8 @@ class FocalLength:
         return f"focal length {self.px:.0f} +- {self.deviation:.2g} px ({self.deviation / self.px:.1%})"
 
     def doubts(self, *, mend: str) -> list[str]:
-        """A sentence where the deviation is above SURE, none where it is not; `mend` says what to do."""
-        if self.deviation is None or self.deviation <= SURE * self.px:
+        """A sentence where the deviation is above `TABLE.sure`, none where it is not; `mend` says what to do."""
+        if self.deviation is None or self.deviation <= TABLE.sure * self.px:
             return []
         return [f"{self.describe()}: lengths above the table are as uncertain; {mend}"]
 
@@ -41,8 +39,9 @@ def least_sure(lengths: Sequence[FocalLength]) -> FocalLength:
 def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[FocalLength]:
     """The focal length (the first of two) of each camera of a model, in order of their numbers.
 
-    Deviations are those of its bundle adjustment, which has the principal point in the middle, and what a principal
-    point OFF_MIDDLE changes: of flat scenes and photos from one height nearly all. 100 % where nothing is determined.
+    A deviation is that of the bundle adjustment, which has the principal point in the middle, and what moving that by
+    `TABLE.off_middle` changes: nearly all of it for flat scenes and photos from one height. 100 % where nothing is
+    determined.
     """
     covariance = None if is_given else _covariance(model)
     noise_px, found = _noise_px(model), []
@@ -64,7 +63,7 @@ def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: 
     principal = camera.principal_point_idxs()
     gain = np.linalg.solve(covariance[np.ix_(principal, principal)], covariance[principal, focal])
     variance = covariance[focal, focal] - gain @ covariance[principal, focal]
-    shift_px = OFF_MIDDLE * max(camera.width, camera.height)
+    shift_px = TABLE.off_middle * max(camera.width, camera.height)
     return float(np.sqrt(max(variance, 0) + shift_px**2 * (gain @ gain)))
 
 

@@ -20,6 +20,7 @@ from mvseg.formats.photos import Photos
 from mvseg.formats.positions import read_positions
 from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
 from mvseg.poses.config import Known
+from mvseg.poses.numbers import WORLD
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
@@ -28,8 +29,6 @@ Floats = NDArray[np.float64]
 
 MARKER = "marker:"  # in front of a marker's number, where a photo's name could stand
 PLACE = re.compile(r"(.+?):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)(\+|$)")  # photo:x,y+
-SPREAD = 0.05  # of the sides of markers, above which their size is doubtful
-MISFIT = 0.05  # residual of positions over their spread, above which they hardly fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +108,11 @@ def _by_markers(scene: Scene, side: float, unit: str) -> Placement:
     if not len(sides):
         raise InputError("no whole marker is seen in two photos, expected ArUco or AprilTag markers of --marker's size")
     middle = float(np.median(sides))
-    odd = int((np.abs(sides / middle - 1) > SPREAD).sum())
+    odd = int((np.abs(sides / middle - 1) > WORLD.spread).sum())
     if odd:
-        warn(f"{odd} of {len(sides)} markers differ in size by more than {SPREAD:.0%}: expected prints of one size")
+        warn(
+            f"{odd} of {len(sides)} markers differ in size by more than {WORLD.spread:.0%}: expected prints of one size"
+        )
     residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
     return Placement(
         similarity=scale_by(side / middle),
@@ -208,7 +209,7 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     with faults_of(path):
         alignment = align(centers, target)
     share = alignment.rms / spreads(target)[0]
-    if share > MISFIT:
+    if share > WORLD.misfit:
         warn(f"{path}: the positions hardly fit the photos (residual {share:.0%} of their spread): do the names match?")
     return Placement(
         similarity=alignment.similarity,

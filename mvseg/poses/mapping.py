@@ -15,14 +15,13 @@ import pycolmap
 from mvseg.errors import InputError
 from mvseg.formats.opencv_yaml import Calibration
 from mvseg.poses.cancellable import run_cancellable
-from mvseg.poses.config import LEAST, LEAST_SHARE, PoseConfig
-from mvseg.poses.features import SEED, extract_features, find_features, make_database, match_features, number_photos
+from mvseg.poses.config import PoseConfig
+from mvseg.poses.features import extract_features, find_features, make_database, match_features, number_photos
+from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
 from mvseg.poses.photo_files import PhotoFile, calibrated_size
 from mvseg.system.running import progress_bar
 
-FEW_FEATURES = 300  # number of features below which a photo has too little texture
-ENOUGH = 0.9  # share of the photos below which all is done again with more features; at 1, a blurred one costs minutes
 PHOTOS = "photos"  # folder of the photos that COLMAP sees
 NEXT_STEPS = (
     "more photos with more overlap (every 5 to 10 degrees), sharper and brighter ones, a textured background or table "
@@ -84,11 +83,11 @@ def find_structure(
     with tempfile.TemporaryDirectory(dir=work, prefix="colmap-") as folder:
         task = _Task(Path(folder), number_photos(images, photos, Path(folder) / PHOTOS), config, lens)
         models, pairs, plain = _map_quickly(task)
-        if not models or models[0].num_reg_images() < ENOUGH * len(photos):
+        if not models or models[0].num_reg_images() < STRUCTURE.enough * len(photos):
             models = _sorted([*models, *_map_thoroughly(task, pairs)])
         photo_of = task.photo_of
     found = models[0].num_reg_images() if models else 0
-    least = config.min_registered or max(LEAST, round(LEAST_SHARE * len(photos)))
+    least = config.min_registered or max(STRUCTURE.least, round(STRUCTURE.least_share * len(photos)))
     if found < min(least, len(photos)):
         raise InputError(_too_few(found, len(photos), least, plain=plain, given=config.min_registered is not None))
     model = models[0]
@@ -163,10 +162,11 @@ def _is_whole(models: Sequence[pycolmap.Reconstruction], task: _Task) -> bool:
 def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's own, on one thread. With `few_matches` a photo needs less to register: plants that fill photos taken 30
     degrees apart share few features."""
-    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=SEED, min_model_size=LEAST)
+    least, seed = STRUCTURE.least, STRUCTURE.seed
+    options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=least)
     mapper = options.mapper
     mapper.num_threads = 1
-    mapper.random_seed = options.triangulation.random_seed = SEED
+    mapper.random_seed = options.triangulation.random_seed = seed
     if fix_lens:
         options.ba_refine_focal_length = options.ba_refine_extra_params = False
         mapper.abs_pose_refine_focal_length = mapper.abs_pose_refine_extra_params = False
@@ -199,14 +199,14 @@ def _map(task: _Task, database: Path, *, few_matches: bool) -> list[pycolmap.Rec
 def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile]) -> tuple[str, ...]:
     with pycolmap.Database.open(database) as opened:
         counts = {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
-    return tuple(photo.name for name, photo in photo_of.items() if counts[name] < FEW_FEATURES)
+    return tuple(photo.name for name, photo in photo_of.items() if counts[name] < STRUCTURE.few_features)
 
 
 def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
     """The sentence for too few registered photos."""
     poor = f"; {len(plain)} have hardly any texture, the first is {plain[0]}" if plain else ""
     asked = "--min_registered asks for" if given else "expected at least"
-    less = "" if given or found < LEAST else f", or --min_registered {found} to accept these"
+    less = "" if given or found < STRUCTURE.least else f", or --min_registered {found} to accept these"
     text = f"{found} of {num_photos} photos could be registered, {asked} {least}{poor}"
     return f"{text}. Next: {NEXT_STEPS}{less}"
 

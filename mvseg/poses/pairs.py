@@ -10,14 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.poses.config import Pairs
-
-FEW = 30  # photos up to which all pairs are compared: 435 pairs, 10 to 20 s of one core; a third more takes double
-OVERLAP = 4  # neighbours on either side in a sequence; one fewer saves a tenth of the pairs: bridges of blurred photos
-FAR = 2  # neighbours further away are 2 x OVERLAP, 4 x OVERLAP, ... steps off
-MOST_ALIKE = 6  # further photos that each photo is compared with; a third more are an eighth more pairs
-# Coarse features that must match. Of the pairs of a plant that so many choose, half have 30 good matches; at 6 a third
-# of them have, at 10 three quarters, but a few good pairs more are missed.
-LEAST_ALIKE = 8
+from mvseg.poses.numbers import STRUCTURE
 
 Pair = tuple[int, int]
 
@@ -27,18 +20,18 @@ def choose_pairs(
 ) -> list[Pair]:
     """Pairs of photos to compare, as indices i < j, each once, in order; every photo is in one of them.
 
-    "exhaustive" are all pairs. "sequential" is for walks round a plant and turntables: each photo with its OVERLAP
-    next neighbours on either side and with some further away, the last photos being neighbours of the first. Photos of
+    "exhaustive" are all pairs. "sequential" is for walks round a plant and turntables: each photo with its next
+    neighbours on either side and with some further away, the last photos being neighbours of the first. Photos of
     different folders (one per camera) are neighbours if their places in their sequences are. By default each photo is
-    also compared with the MOST_ALIKE others that look most like it, wherever they are in the order: a walk that comes
-    back to where it was closes, and photos in no order find each other.
+    also compared with the others that look most like it, wherever they are in the order: a walk that comes back to
+    where it was closes, and photos in no order find each other.
 
     Args:
         names: paths of the photos, "/" between folders, in the order in which they were taken.
-        pairs: None: exhaustive for FEW photos; sequential and alike for more.
+        pairs: None: exhaustive for `STRUCTURE.few` photos; sequential and alike for more.
         alike: (V, V) how alike the photos are, see `count_alike`; without it the order alone counts.
     """
-    if pairs == "exhaustive" or (pairs is None and len(names) <= FEW):
+    if pairs == "exhaustive" or (pairs is None and len(names) <= STRUCTURE.few):
         return list(combinations(range(len(names)), 2))
     sequences: dict[str, list[int]] = defaultdict(list)
     for index, name in enumerate(names):
@@ -62,20 +55,20 @@ def pairs_with(some: Iterable[int], num_photos: int) -> list[Pair]:
 
 def _steps(num_photos: int) -> list[int]:
     """How far off the neighbours of a photo are, in a sequence."""
-    steps = list(range(OVERLAP + 1))
-    while steps[-1] * FAR <= num_photos // 2:
-        steps.append(steps[-1] * FAR)
+    steps = list(range(STRUCTURE.overlap + 1))
+    while steps[-1] * STRUCTURE.far <= num_photos // 2:
+        steps.append(steps[-1] * STRUCTURE.far)
     return [sign * step for step in steps for sign in (1, -1)]
 
 
 def _most_alike(alike: NDArray[np.int64], known: set[Pair]) -> set[Pair]:
-    """The MOST_ALIKE photos for each photo, not counting known pairs."""
+    """The photos that are most alike for each photo, not counting known pairs."""
     left = alike.copy()
     for i, j in known:
         left[i, j] = left[j, i] = 0
     found = set()
     for i, row in enumerate(left):
-        for j in np.argsort(-row, kind="stable")[:MOST_ALIKE]:
-            if row[j] >= LEAST_ALIKE and i != j:
+        for j in np.argsort(-row, kind="stable")[: STRUCTURE.most_alike]:
+            if row[j] >= STRUCTURE.least_alike and i != j:
                 found.add((min(i, int(j)), max(i, int(j))))
     return found

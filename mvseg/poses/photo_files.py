@@ -24,10 +24,10 @@ from mvseg.formats.image_file import (
     write_png,
 )
 from mvseg.formats.opencv_yaml import Calibration
+from mvseg.poses.numbers import STRUCTURE
 from mvseg.system.running import progress_bar
 
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
-QUALITY = 95  # of a JPEG that is written anew, upright
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
         folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
         files += [path for each in folders for path in _files_in(each)]
     photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
-    if len(photos) < 3:
+    if len(photos) < STRUCTURE.least:
         kinds = "JPEG, PNG, TIFF, BMP, WebP, HEIC"
         raise InputError(f"{folder}: found {len(photos)} photos ({kinds}), expected at least three")
     first_with: dict[str, str] = {}
@@ -145,7 +145,7 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
         exif[ORIENTATION] = orientation
         image = ImageOps.exif_transpose(image)
         exif[ORIENTATION] = 1
-        image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)
+        image.convert("RGB").save(path, format="JPEG", quality=STRUCTURE.quality, subsampling=0, exif=exif)
     elif turned or path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
         path = path.with_suffix(".png")
         pixels = turn_upright(read_rgb(source, bits=bits), orientation)

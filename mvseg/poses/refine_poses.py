@@ -25,21 +25,11 @@ from mvseg.matching.tangency import (
     pair_outlines,
     tangency_residuals,
 )
+from mvseg.poses.numbers import REFINE
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
 Match = Callable[[Cameras], Matching]
-
-ROUNDS = 3  # of refining and matching again, at most
-LEAST_RESIDUAL = 1.0  # pixels; a smaller residual of the given poses is the masks' own error
-CLEAR = 0.8  # share of the residual that may be left of refined poses
-LOSS = 0.02  # of the mean match score, that does not count as one
-STEPS = 20  # of Gauss-Newton, at most
-CONVERGED = 0.02  # units, largest step
-# In units of one pixel, or more where photos are large: masks of these are drawn less exactly.
-POSE, GROWTH = 10.0, 2.0  # standard deviations of poses, along each axis, and of how tightly a mask is drawn
-LEAST_SIGMA, DOUBTED = 0.5, 2.0  # of residuals; and the number of standard deviations from which a residual is doubted
-FOLDS = 5  # of the instances
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +52,10 @@ class RefinedPoses:
 def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     """Match, refine the poses, match with these, and so on until no id changes.
 
-    Poses whose residuals are below `LEAST_RESIDUAL` stay. Refined ones are taken when they explain leaves that they
-    were not fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as with
-    these. Otherwise the given ones stay as if nothing had been tried. What matching warns of on the way is not passed
-    on.
+    Poses whose residuals are below `REFINE.least_residual_px` stay. Refined ones are taken when they explain leaves
+    that they were not fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as
+    with these. Otherwise the given ones stay as if nothing had been tried. What matching warns of on the way is not
+    passed on.
 
     Args:
         cameras: V cameras, as they are given; the refined ones are on their device.
@@ -75,8 +65,8 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
         warnings.simplefilter("ignore")
         given = matching = match(cameras)
         refined, residual_px = cameras, held_out_residuals(matching.masks, cameras)
-        for _ in range(ROUNDS):
-            if not (residual_px[0] >= LEAST_RESIDUAL and residual_px[1] < residual_px[0]):
+        for _ in range(REFINE.rounds):
+            if not (residual_px[0] >= REFINE.least_residual_px and residual_px[1] < residual_px[0]):
                 break
             refined = fit_poses(adjust(matching.masks, cameras)).to(cameras.device)
             before, matching = matching.masks, match(refined)
@@ -84,8 +74,9 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
             if same and torch.equal(before.instance_ids, matching.masks.instance_ids):
                 break
             residual_px = held_out_residuals(matching.masks, cameras)
-    is_off = residual_px[0] >= LEAST_RESIDUAL
-    is_better = is_off and residual_px[1] <= CLEAR * residual_px[0] and mean_score(matching) >= mean_score(given) - LOSS
+    is_off = residual_px[0] >= REFINE.least_residual_px
+    is_sure = mean_score(matching) >= mean_score(given) - REFINE.loss
+    is_better = is_off and is_sure and residual_px[1] <= REFINE.clear * residual_px[0]
     return RefinedPoses(cameras=refined if is_better else cameras, is_refined=is_better, residual_px=residual_px)
 
 
@@ -133,8 +124,8 @@ class Adjustment:
 
     def weights(self, residuals: TangencyResiduals, left_px: Tensor) -> Tensor:
         """(T,) weights by Geman and McClure: what a neighbour hides ends elsewhere, and so does another leaf."""
-        sigma = max(LEAST_SIGMA * self.unit_px, 1.4826 * float(left_px.abs().median()))
-        return residuals.weight / sigma**2 / (1 + (left_px / (DOUBTED * sigma)) ** 2) ** 2
+        sigma = max(REFINE.least_sd * self.unit_px, 1.4826 * float(left_px.abs().median()))
+        return residuals.weight / sigma**2 / (1 + (left_px / (REFINE.doubted * sigma)) ** 2) ** 2
 
 
 def adjust(masks: Masks, cameras: Cameras) -> Adjustment:
@@ -165,10 +156,10 @@ def fit_poses(problem: Adjustment) -> Cameras:
     small). What the masks do not tell, as the similarity of the world, stays as given: the poses have a prior there.
     """
     num_views, num_outlines = len(problem.cameras), len(problem.outlines.view)
-    sigmas = torch.cat((torch.full((6 * num_views,), POSE), torch.full((num_outlines,), GROWTH))).double()
-    prior = (sigmas * problem.unit_px) ** -2
+    sigmas = torch.tensor([REFINE.pose_sd, REFINE.growth_sd], dtype=torch.float64)
+    prior = (sigmas * problem.unit_px).repeat_interleave(torch.tensor([6 * num_views, num_outlines])) ** -2
     state, cameras = torch.zeros(len(prior)).double(), problem.cameras
-    for _ in range(STEPS):
+    for _ in range(REFINE.steps):
         residuals = problem.residuals(cameras)
         if not len(residuals.px):
             break
@@ -180,7 +171,7 @@ def fit_poses(problem: Adjustment) -> Cameras:
         step = _solve(columns, slopes, left_px, weights=problem.weights(residuals, left_px), prior=prior, state=state)
         state = state + step
         cameras = move_cameras(cameras, step[: 6 * num_views].reshape(-1, 6), problem.world_per_px)
-        if step.abs().max() < CONVERGED * problem.unit_px:
+        if step.abs().max() < REFINE.converged * problem.unit_px:
             break
     return cameras
 
@@ -204,8 +195,8 @@ def held_out_residuals(masks: Masks, cameras: Cameras) -> tuple[float, float]:
     """Pixels; mean over the views of the median residual of their leaves, with the given cameras, and with cameras that
     are refined without these leaves. NaN where there are no residuals."""
     problem, parts = adjust(masks, cameras), []
-    fold = problem.outlines.instance % FOLDS
-    for number in range(FOLDS):
+    fold = problem.outlines.instance % REFINE.folds
+    for number in range(REFINE.folds):
         if (fold == number).any():
             looked_at, fitted = problem.select(fold == number), fit_poses(problem.select(fold != number))
             parts.append([_remaining_residuals(looked_at, cameras) for cameras in (problem.cameras, fitted)])
@@ -218,14 +209,14 @@ def held_out_residuals(masks: Masks, cameras: Cameras) -> tuple[float, float]:
 def _remaining_residuals(problem: Adjustment, cameras: Cameras) -> Tensor:
     """(3, T) float64: what is left of each residual when masks may be drawn too tightly, and its two views."""
     residuals = problem.residuals(cameras)
-    prior = torch.full((len(problem.outlines.view),), (GROWTH * problem.unit_px) ** -2).double()
+    prior = torch.full((len(problem.outlines.view),), (REFINE.growth_sd * problem.unit_px) ** -2).double()
     growth, left_px = torch.zeros_like(prior), residuals.px
-    for _ in range(STEPS if len(residuals.px) else 0):
+    for _ in range(REFINE.steps if len(residuals.px) else 0):
         weights = problem.weights(residuals, left_px)
         step = _solve(residuals.outlines, residuals.by_growth, left_px, weights=weights, prior=prior, state=growth)
         growth = growth + step
         left_px = residuals.px + (residuals.by_growth * growth[residuals.outlines]).sum(1)
-        if step.abs().max() < CONVERGED * problem.unit_px:
+        if step.abs().max() < REFINE.converged * problem.unit_px:
             break
     return torch.cat((left_px.abs()[None], problem.outlines.view[residuals.outlines].T.double()))
 

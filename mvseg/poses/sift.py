@@ -15,15 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.poses.numbers import STRUCTURE
+
 Floats = NDArray[np.float32]
 Photo = NDArray[np.uint8]
-
-CONTRAST = 0.02  # COLMAP's; a third less finds a quarter more features of a plant before black cloth, and more noise
-EDGE = 10.0  # Lowe's and COLMAP's ratio of curvatures
-HALF = 0.5  # OpenCV's pixel centres are whole numbers, ours half integers
-UNIT = 512.0  # COLMAP's bytes of a descriptor of length 1
-COARSE = 256  # features of a photo that are compared first: photos have 20 to 120 in common, or 5; time is its square
-RATIO = 0.8  # Lowe's: the best match must be this much nearer than the second best
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +29,7 @@ class Sift:
         px: (N, 2) float32, pixels of the photo, pixel centres at half integers.
         scale: (N,) float32, standard deviation of the blur at which the feature was found, pixels of the photo.
         angle: (N,) float32, radians.
-        descriptors: (N, 128) uint8, square roots of histograms, UNIT long (to rounding).
+        descriptors: (N, 128) uint8, square roots of histograms, `STRUCTURE.unit` long (to rounding).
     """
 
     px: Floats
@@ -46,7 +41,7 @@ class Sift:
         return len(self.px)
 
 
-def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = CONTRAST) -> Sift:
+def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = STRUCTURE.contrast) -> Sift:
     """The features of most contrast.
 
     Args:
@@ -60,7 +55,7 @@ def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = CON
     size = tuple(max(1, round(factor * side)) for side in grey.shape[::-1])
     small = grey if factor == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     finder = cv2.SIFT.create(
-        nfeatures=most, contrastThreshold=contrast, edgeThreshold=EDGE, enable_precise_upscale=True
+        nfeatures=most, contrastThreshold=contrast, edgeThreshold=STRUCTURE.edge, enable_precise_upscale=True
     )
     points, histograms = finder.detectAndCompute(small, None)
     if not points:
@@ -71,17 +66,18 @@ def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = CON
     zoom = np.array(grey.shape[::-1], np.float32) / size
     roots = np.sqrt(histograms / np.maximum(histograms.sum(1, keepdims=True), 1e-9))
     return Sift(
-        px=(np.array([point.pt for point in points], np.float32) + HALF) * zoom,
+        px=(np.array([point.pt for point in points], np.float32) + 0.5)
+        * zoom,  # OpenCV's pixel centres are whole numbers
         scale=np.array([point.size / 2 for point in points], np.float32) * zoom.max(),
         angle=np.radians(np.array([point.angle for point in points], np.float32)),
-        descriptors=np.clip(np.rint(UNIT * roots), 0, 255).astype(np.uint8),
+        descriptors=np.clip(np.rint(STRUCTURE.unit * roots), 0, 255).astype(np.uint8),
     )
 
 
 def coarsest(sift: Sift) -> NDArray[np.uint8]:
-    """(C, 128): descriptors of the COARSE features of largest scale, which are seen best from elsewhere (Wu, Towards
-    linear-time incremental structure from motion, 3DV 2013)."""
-    return sift.descriptors[np.argsort(-sift.scale, kind="stable")[:COARSE]]
+    """(C, 128): descriptors of the features of largest scale, `STRUCTURE.coarse` at most, which are seen best from
+    elsewhere (Wu, Towards linear-time incremental structure from motion, 3DV 2013)."""
+    return sift.descriptors[np.argsort(-sift.scale, kind="stable")[: STRUCTURE.coarse]]
 
 
 def count_alike(photos: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
@@ -93,18 +89,18 @@ def count_alike(photos: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
 
 
 def match_descriptors(
-    one: NDArray[np.uint8], other: NDArray[np.uint8], *, back_ratio: float = RATIO
+    one: NDArray[np.uint8], other: NDArray[np.uint8], *, back_ratio: float = STRUCTURE.ratio
 ) -> NDArray[np.int64]:
     """(M, 2) rows of descriptors (A, 128) and (B, 128) that match.
 
-    Each is the other's nearest and nearer than the second nearest: RATIO of it as seen from the first, `back_ratio` of
-    it as seen from the other; 1 asks for the nearest only.
+    Each is the other's nearest and nearer than the second nearest: `STRUCTURE.ratio` of it as seen from the first,
+    `back_ratio` of it as seen from the other; 1 asks for the nearest only.
     """
     if min(len(one), len(other)) < 2:
         return np.zeros((0, 2), np.int64)
     one, other = (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9) for rows in (one, other))
     cosines = one.astype(np.float32) @ other.astype(np.float32).T
-    return np.argwhere(_clear_best(cosines, RATIO) & _clear_best(cosines.T, back_ratio).T)
+    return np.argwhere(_clear_best(cosines, STRUCTURE.ratio) & _clear_best(cosines.T, back_ratio).T)
 
 
 def _clear_best(cosines: Floats, ratio: float) -> NDArray[np.bool_]:

@@ -22,17 +22,16 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from mvseg.poses.focal_length import OFF_MIDDLE
+from mvseg.poses.numbers import TABLE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-HALF = 0.5  # OpenCV's pixels start at -0.5
-NUM_LENS = 7  # numbers of a lens: f in widths of the photo; cx and cy from its middle, in widths; k1, k2, p1, p2
 # How far lenses of phones, cameras and webcams are from a pinhole with its axis in the middle: standard deviations of
 # the numbers of a lens but f. Most of what a flat board leaves open is the principal point's: at twice that, f is half
 # as sure; a third of the others changes its deviation by less than a twentieth.
-USUAL = np.array([OFF_MIDDLE, OFF_MIDDLE, 0.3, 0.3, 0.001, 0.001])
+USUAL = np.array([TABLE.off_middle, TABLE.off_middle, 0.3, 0.3, 0.001, 0.001])
+NUM_LENS = 1 + len(USUAL)  # f in widths of the photo; cx and cy from its middle, in widths; k1, k2, p1, p2
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,10 +172,10 @@ def _project(cameras: Sequence[TableCamera], pose: Floats, angles: Floats, sight
         here = sightings.camera == index
         turn = Rotation.from_matrix(camera.R).as_rotvec()
         px, _ = cv2.projectPoints(turned[here], turn, camera.t, opencv_matrix(camera.K), camera.distortion)
-        errors[here] = px[:, 0] - (sightings.px[here] - HALF)
+        errors[here] = px[:, 0] - (sightings.px[here] - 0.5)
     return errors
 
 
 def opencv_matrix(K: Floats) -> Floats:
     """K for OpenCV, whose first pixel has its centre at (0, 0)."""
-    return K - [[0, 0, HALF], [0, 0, HALF], [0, 0, 0]]
+    return K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]

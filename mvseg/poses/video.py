@@ -17,21 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError
+from mvseg.poses.numbers import STRUCTURE, VIDEO
 from mvseg.system.running import progress_bar
 
 Grey = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-LEAST_FRAMES = 3  # structure from motion needs as many
-STEP = 0.025  # of the picture's longer side, from photo to photo: 8 degrees round a plant; a third more is 10 degrees
-ANEW = 0.06  # of the longer side, after which new corners are found; a third less changes nothing, less counts shakes
-PER_SECOND = 15.0  # frames that are looked at; a third fewer leave less choice of sharp ones, and cost a third less
-SMALL = 480  # pixels of the longer side, where corners are followed; at a third fewer, blur shows a tenth less
-CORNERS = 200  # followed at once; with a third fewer or more the motion is measured as a tenth less or more
-WINDOW, LEVELS = 21, 4  # pixels, halvings: OpenCV's window, and motion of up to 160 pixels of SMALL
-KEPT = 0.5  # share of the corners that are still followed, below which new ones are found
-QUALITY = 95  # of the JPEG files
 SILENT = "-8"  # of FFmpeg's log, which is for its developers
 
 
@@ -68,22 +60,22 @@ def write_frames(clip: Path, folder: Path, *, most: int) -> list[str]:
     """
     footage = watch(clip)
     chosen = set(choose_frames(footage, most=most))
-    if len(chosen) < LEAST_FRAMES:
-        moved = footage.motion[-1]
+    if len(chosen) < STRUCTURE.least:
+        moved, wanted = footage.motion[-1], STRUCTURE.least * VIDEO.step
         message = f"the picture moves by {moved:.0%} of its longer side in {len(footage.frames)} frames"
-        raise InputError(f"{clip}: {message}, expected {LEAST_FRAMES * STEP:.0%} or more: a walk round the plant")
+        raise InputError(f"{clip}: {message}, expected {wanted:.0%} or more: a walk round the plant")
     folder.mkdir(parents=True)
     names = []
     with _opened(clip) as video:
         for number, frame in _read(video, sorted(chosen)):
             names.append(f"frame-{number:06d}.jpg")
-            if not cv2.imwrite(str(folder / names[-1]), frame, [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
+            if not cv2.imwrite(str(folder / names[-1]), frame, [cv2.IMWRITE_JPEG_QUALITY, STRUCTURE.quality]):
                 raise OSError(f"{folder / names[-1]} cannot be written")
     return names
 
 
 def watch(clip: Path) -> Footage:
-    """Measure motion and sharpness over a video, PER_SECOND frames of each second.
+    """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second.
 
     Raises:
         InputError: the video cannot be opened, or has no frames.
@@ -93,7 +85,7 @@ def watch(clip: Path) -> Footage:
     sharpness: list[float] = []
     with _opened(clip) as video, progress_bar(name="video", unit="frame") as bar:
         rate = video.get(cv2.CAP_PROP_FPS)
-        every = max(1, round(rate / PER_SECOND)) if 0 < rate < 1000 else 1
+        every = max(1, round(rate / VIDEO.per_second)) if 0 < rate < 1000 else 1
         track, base = None, 0.0
         for number, frame in _read(video, every=every):
             grey = _shrink(frame)
@@ -109,13 +101,13 @@ def watch(clip: Path) -> Footage:
 
 
 def choose_frames(footage: Footage, *, most: int) -> list[int]:
-    """Numbers of frames that are about STEP (or a `most`-th of all motion, if that is more) apart.
+    """Numbers of frames that are about `VIDEO.step` (or a `most`-th of all motion, if that is more) apart.
 
     The motion is cut into equal parts, and the sharpest frame in the middle half of each is taken: two in a row are
     half a part to one and a half parts apart, where the video has frames there.
     """
     total = float(footage.motion[-1])
-    number = min(most, int(total / STEP + 1e-9))
+    number = min(most, int(total / VIDEO.step + 1e-9))
     chosen: list[int] = []
     for part in range(number):
         place = footage.motion / total * number - part  # 0 to 1 within the part
@@ -139,7 +131,7 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
     """The corners in the next picture; the median of how far they are from where they were found, and how much of that
     is to be added to all that follows, since new corners are found. In longer sides.
 
-    A picture in which no corner is found again (a cut, a jerk) counts as a STEP.
+    A picture in which no corner is found again (a cut, a jerk) counts as `VIDEO.step`.
     """
     if track is None or not len(track.now):
         return _find_corners(grey), 0.0, 0.0
@@ -147,11 +139,11 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
     back, returned = _flow(grey, track.grey, now)
     is_same = np.linalg.norm(back - track.now, axis=2)[:, 0] < 1  # pixel
     is_kept = found & returned & is_same
-    if is_kept.sum() < LEAST_FRAMES:
-        return _find_corners(grey), STEP, STEP
+    if is_kept.sum() < VIDEO.least_corners:
+        return _find_corners(grey), VIDEO.step, VIDEO.step
     start, now = track.start[is_kept], now[is_kept]
     moved = float(np.median(np.linalg.norm(now - start, axis=2))) / max(grey.shape)
-    if moved < ANEW and is_kept.sum() >= KEPT * len(is_kept):
+    if moved < VIDEO.anew and is_kept.sum() >= VIDEO.kept * len(is_kept):
         return _Track(start=start, now=now, grey=grey), moved, 0.0
     return _find_corners(grey), moved, moved
 
@@ -159,20 +151,20 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
 def _flow(before: Grey, after: Grey, corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where corners (C, 1, 2) are in the other picture, and (C,) whether they were found."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
-        before, after, corners, np.zeros_like(corners), winSize=(WINDOW, WINDOW), maxLevel=LEVELS
+        before, after, corners, np.zeros_like(corners), winSize=(VIDEO.window, VIDEO.window), maxLevel=VIDEO.levels
     )
     return np.asarray(moved, np.float32), np.asarray(found)[:, 0] == 1
 
 
 def _find_corners(grey: Grey) -> _Track:
-    found = cv2.goodFeaturesToTrack(grey, CORNERS, 0.01, max(grey.shape) / 60)
+    found = cv2.goodFeaturesToTrack(grey, VIDEO.corners, 0.01, max(grey.shape) / 60)
     corners = np.zeros((0, 1, 2), np.float32) if found is None else np.asarray(found, np.float32)
     return _Track(start=corners, now=corners, grey=grey)
 
 
 def _shrink(frame: NDArray[np.uint8]) -> Grey:
     grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    factor = SMALL / max(grey.shape)
+    factor = VIDEO.small / max(grey.shape)
     small = grey if factor >= 1 else cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.uint8)
 

@@ -20,6 +20,7 @@ from mvseg.poses import features, mapping
 from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.mapping import find_structure
+from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
 from room_scene import FOCAL, HEIGHT, WIDTH, draw_room, room_cameras, texture
@@ -100,7 +101,7 @@ def test_photos_that_chosen_pairs_leave_out_are_compared_with_all(room, monkeypa
 @pytest.mark.slow
 def test_too_few_matches_ask_for_more_features(room, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = watch_stages(monkeypatch)
-    monkeypatch.setattr(features, "QUICK_MOST", 12)
+    monkeypatch.setattr(features, "STRUCTURE", replace(STRUCTURE, quick_most=12))
     structure = find_structure(room.folder / IMAGES, room.files, config=PoseConfig())
     assert steps[-3:] == ["extract_features", "match_features 21", "_map"]
     assert structure.registered == tuple(photo.name for photo in room.files)

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mvseg.poses.sift import COARSE, RATIO, UNIT, coarsest, count_alike, find_sift, match_descriptors
+from mvseg.poses.numbers import STRUCTURE
+from mvseg.poses.sift import coarsest, count_alike, find_sift, match_descriptors
 from room_scene import texture
 
 
@@ -39,7 +40,7 @@ def test_descriptors_have_one_length_and_no_more_are_kept_than_asked_for() -> No
     sift = find_sift(rgb(), image_size=1000, most=200)
     assert len(sift) == 200
     assert sift.descriptors.dtype == np.uint8
-    np.testing.assert_allclose(np.linalg.norm(sift.descriptors.astype(float), axis=1), UNIT, rtol=0.02)
+    np.testing.assert_allclose(np.linalg.norm(sift.descriptors.astype(float), axis=1), STRUCTURE.unit, rtol=0.02)
 
 
 def test_a_photo_without_texture() -> None:
@@ -52,7 +53,7 @@ def test_alike_is_what_a_plain_count_says() -> None:
     """And pictures of one thing are alike, those of others are not."""
     pictures = [rgb(0)[:300, :400], rgb(0)[60:360, 80:480], rgb(1)[:300, :400]]
     coarse = [coarsest(find_sift(picture, image_size=1000, most=4000)) for picture in pictures]
-    assert all(len(each) == COARSE for each in coarse)
+    assert all(len(each) == STRUCTURE.coarse for each in coarse)
     alike = count_alike(coarse)
     assert (alike == alike.T).all()
     assert (alike.diagonal() == 0).all()
@@ -67,5 +68,5 @@ def test_alike_is_what_a_plain_count_says() -> None:
             nearest, second = np.sort(distances)[:2]
             back = np.sort(apart[:, column])[:2]
             is_mutual = int(apart[:, column].argmin()) == row
-            count += is_mutual and nearest <= RATIO * second and back[0] <= RATIO * back[1]
+            count += is_mutual and nearest <= STRUCTURE.ratio * second and back[0] <= STRUCTURE.ratio * back[1]
         assert alike[i, j] == pytest.approx(count, abs=1)  # float32 rounds

@@ -10,7 +10,8 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import read_rgb
-from mvseg.poses.video import STEP, Footage, choose_frames, is_video, watch, write_frames
+from mvseg.poses.numbers import VIDEO
+from mvseg.poses.video import Footage, choose_frames, is_video, watch, write_frames
 from room_scene import texture
 
 WIDTH, HEIGHT = 320, 240
@@ -54,8 +55,8 @@ def test_frames_are_sharp_and_spread_by_motion(walk: Path, tmp_path: Path) -> No
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == names
     numbers = np.array([int(name[len("frame-") : -len(".jpg")]) for name in names])
     assert (np.diff(numbers) > 0).all()
-    steps = np.diff(PLACES[numbers]) / WIDTH / STEP
-    assert len(names) == pytest.approx(PLACES[-1] / WIDTH / STEP, abs=2)
+    steps = np.diff(PLACES[numbers]) / WIDTH / VIDEO.step
+    assert len(names) == pytest.approx(PLACES[-1] / WIDTH / VIDEO.step, abs=2)
     assert (steps > 0.4).all()
     assert (steps < 2.1).all()
     assert (numbers[numbers < 130] % 3 == 0).all()  # where the camera runs, a step holds two frames only
@@ -83,12 +84,12 @@ def test_fast_videos_are_looked_at_fifteen_times_a_second(tmp_path: Path) -> Non
 @pytest.mark.parametrize("seed", range(3))
 def test_laws_of_the_choice(most: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    motion = np.cumsum(rng.exponential(STEP / 6, 200) * (rng.random(200) < 0.8))
+    motion = np.cumsum(rng.exponential(VIDEO.step / 6, 200) * (rng.random(200) < 0.8))
     footage = Footage(frames=np.arange(200) * 2, motion=motion, sharpness=rng.random(200))
     chosen = choose_frames(footage, most=most)
     assert chosen == sorted(set(chosen))
     assert set(chosen) <= set(footage.frames.tolist())
-    part = motion[-1] / min(most, int(motion[-1] / STEP))
+    part = motion[-1] / min(most, int(motion[-1] / VIDEO.step))
     assert len(chosen) >= 0.9 * motion[-1] / part
     assert np.diff(motion[np.array(chosen) // 2]).max() < 2 * part
     middle = np.abs(motion[:, None] / part % 1 - 0.5)[:, 0] <= 0.25
@@ -115,7 +116,7 @@ def test_a_cut_counts_as_a_step(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "cut.mp4", [*pan(np.zeros(6, int)), *other])
     motion = watch(clip).motion
     assert motion[5] < 0.01
-    assert motion[6] - motion[5] >= 0.9 * STEP
+    assert motion[6] - motion[5] >= 0.9 * VIDEO.step
 
 
 @pytest.mark.parametrize("content", [b"", b"no video", b"\0\0\0\x20ftypisom" + bytes(200)])

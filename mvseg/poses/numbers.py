@@ -1,0 +1,105 @@
+"""The numbers of poses: definitions, technical limits, and thresholds, with what a third less or more does to photos.
+
+They are read for --help, too: this module loads no torch. docs/pose.md says what cameras they give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class StructureNumbers:
+    """Cameras from photos alone."""
+
+    least: int = 3  # limit: photos, at least: structure from motion needs as many
+    least_share: float = 0.6  # share of the photos that must register, unless `min_registered` says otherwise
+    enough: float = 0.9  # share of photos that register, below which more features are found; at 1, blur costs minutes
+    few_features: int = 300  # features below which a photo has too little texture
+    quick_size: int = 1600  # limit: pixels of the longer side at first; a third more takes twice as long
+    quick_most: int = 4096  # limit: features of a photo at first; a third more take half as long again to match
+    contrast: float = 0.02  # contrast of a feature, at least: COLMAP's; a third less finds more, and more noise
+    edge: float = 10.0  # definition: ratio of curvatures of a feature, at most: Lowe's and COLMAP's
+    ratio: float = 0.8  # definition: distance of the best match, in that of the second best, at most: Lowe's
+    unit: float = 512.0  # definition: COLMAP's bytes of a descriptor of length 1
+    coarse: int = 256  # limit: features that are compared first, in squared time: photos share 20 to 120, or 5
+    few: int = 30  # limit: photos of which all pairs are compared, 10 to 20 s of one core; a third more takes double
+    overlap: int = 4  # neighbours on either side that a photo is compared with: they bridge blurred ones
+    far: int = 2  # factor from step to step of neighbours that are further away
+    most_alike: int = 6  # further photos that a photo is compared with; a third more are an eighth more pairs
+    # Of the pairs of a plant that so many choose, half have 30 good matches; at 6 a third of them have, at 10 three
+    # quarters, but a few good pairs more are missed.
+    least_alike: int = 8  # coarse features that two photos must share to be alike
+    pairs_at_once: int = 100  # limit: pairs of a call, which indexes each photo: at 10 it takes several times as long
+    seed: int = 0  # definition: seed of all random draws
+    quality: int = 95  # definition: JPEG quality of photos that are written anew
+
+
+@dataclass(frozen=True)
+class VideoNumbers:
+    """Photos from a video; lengths are shares of the picture's longer side."""
+
+    step: float = 0.025  # motion from photo to photo: 8 degrees round a plant; a third more is 10 degrees
+    anew: float = 0.06  # motion after which new corners are found; a third less changes nothing, less counts shakes
+    per_second: float = 15.0  # limit: frames that are looked at; a third fewer leave less choice of sharp ones
+    small: int = 480  # pixels of the longer side where corners are followed; at a third fewer, blur shows a tenth less
+    corners: int = 200  # limit: corners that are followed; a third fewer or more measure a tenth less or more motion
+    least_corners: int = 3  # corners that are found again, at least, to measure a motion
+    kept: float = 0.5  # share of the corners that are still followed, below which new ones are found
+    window: int = 21  # definition: pixels of OpenCV's window around a corner
+    levels: int = 4  # limit: halvings of the picture: motion of up to 160 pixels of `small`
+
+
+@dataclass(frozen=True)
+class WorldNumbers:
+    """Scale and axes from what is known of the world."""
+
+    spread: float = 0.05  # difference of the sides of markers, as a share of the median, above which they are doubtful
+    misfit: float = 0.05  # residual of positions, as a share of their spread, above which they hardly fit
+    flat: float = 0.02  # ratio of spreads below which points are on one line, or in one plane
+    mirrored: float = 0.5  # residual of the best reflection, in that of the best similarity, of left-handed axes
+    trials: int = 300  # limit: random triples of points
+    outlier: float = 3.0  # residual of an inlier, in that which half of the points do not exceed, at most
+    rounding: float = 1e-9  # limit: residual, as a share of the spread of the points, that counts as 0
+
+
+@dataclass(frozen=True)
+class TableNumbers:
+    """A turntable from photos of a board on it, and how sure focal lengths are."""
+
+    least_photos: int = 4  # photos of a camera that show the board, at least
+    least_corners: int = 6  # corners of the board in each of them, at least
+    least_turn: float = 10.0  # degrees of all photos together, at least
+    flat: float = 0.7  # cosine between the axis and the normal of a board that lies, more or less
+    most_residual: float = 0.005  # residual in widths of the photo, above which more than the table has moved
+    rough: float = 1e-3  # limit: relative change of squared residuals at which the first search ends
+    fine: float = 1e-8  # limit: the same of the last one
+    starts: tuple[float, ...] = (0.7, 1.4, 2.8)  # focal lengths in longer sides of the photo: from phones to telephoto
+    noise_px: float = 0.1  # standard deviation of the corners, until it is measured
+    least_noise_px: float = 0.02  # the same that is believed, at least
+    sure: float = 0.01  # standard deviation of a focal length, as a share of it, at most: more shows in heights
+    off_middle: float = 0.01  # the same of principal points of phones, cameras and webcams, of the photo's longer side
+
+
+@dataclass(frozen=True)
+class RefineNumbers:
+    """Poses that are refined by masks. Deviations are in units: pixels, or more in large photos."""
+
+    rounds: int = 3  # limit: rounds of refining and matching again
+    least_residual_px: float = 1.0  # residual of the given poses, at least: a smaller one is the masks' own error
+    clear: float = 0.8  # residual of refined poses, as a share of that of the given ones, at most
+    loss: float = 0.02  # loss of the mean match score that does not count as one
+    steps: int = 20  # limit: steps of Gauss-Newton
+    converged: float = 0.02  # limit: largest part of a step, in units, at which they end
+    pose_sd: float = 10.0  # standard deviation of poses, along each axis
+    growth_sd: float = 2.0  # the same of how tightly a mask is drawn
+    least_sd: float = 0.5  # the same of residuals, at least
+    doubted: float = 2.0  # standard deviations from which a residual is doubted
+    folds: int = 5  # parts of the instances that are held out in turn
+
+
+STRUCTURE = StructureNumbers()
+VIDEO = VideoNumbers()
+WORLD = WorldNumbers()
+TABLE = TableNumbers()
+REFINE = RefineNumbers()
