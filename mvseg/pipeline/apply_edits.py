@@ -8,6 +8,7 @@ import torch
 
 from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections
+from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.matching.match import describe_disagreement, match_masks
@@ -35,6 +36,7 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
     with timed("correct"):
         corrected = apply(corrections, shown, known.scene)
     with timed("match"):
+        corrected = link_halves(corrected, known.masks.to("cpu"), cameras.to("cpu"))
         matching = match_masks(corrected.masks, cameras, config.match, links=corrected.links)
     masks, corrected = apply_everywhere(corrected, matching.masks.to("cpu"))
     if len(shown) and not len(masks):

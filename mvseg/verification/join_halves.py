@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -73,6 +74,14 @@ def touched_surface(part: int, surfaces: Surfaces) -> int | None:
     gaps = {instance: float(tree.query(there)[0].min()) for instance, there in points.items()}
     nearest = min(gaps, key=lambda instance: gaps[instance], default=None)
     return nearest if nearest is not None and gaps[nearest] <= PARTS.touches * surfaces[part].length else None
+
+
+def are_one_leaf(regions: Regions, ids: Tensor, surfaces: Surfaces, *, cameras: Cameras) -> bool:
+    """Whether the instances 1 and 2 of D regions, `ids` (D,) int64, touch, and one surface shows both as well as their
+    own do. A person has said so: neither has to be seen rarely, and many photos may show both."""
+    shown = {instance: each for instance, each in surfaces.items() if each.exists}
+    touches = len(shown) == 2 and touched_surface(1, shown) == 2
+    return touches and _is_one_leaf(regions, ids.numpy(), (1, 2), surfaces=shown, cameras=cameras)
 
 
 def _is_one_leaf(regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras) -> bool:

@@ -21,7 +21,7 @@ from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids, move_pieces
 from mvseg.verification.evidence import Shown
 from mvseg.verification.join_halves import fits_as_well, touched_surface
-from three_leaves import CAMERAS, LEAVES, true_maps
+from three_leaves import CAMERAS, LEAVES, halved_maps, true_maps
 
 
 def check(regions: Regions, ids: Tensor, surfaces: dict[int, LeafSurface] = LEAVES) -> Masks:
@@ -274,19 +274,6 @@ def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]
     assert torch.equal(check(regions, ids, {}).instance_ids, ids)
     empty, nothing = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
     assert len(check(empty, nothing, {})) == 0
-
-
-def halved_maps(views: tuple[int, ...]) -> list[np.ndarray]:
-    """Something crosses leaf 1, here or there: what lies right of it is 11 in these views, and nothing in others."""
-    maps = true_maps()
-    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
-    for view, labels in enumerate(maps):
-        rays = np.stack([u, v, np.ones_like(u)], -1) @ CAMERAS.world_from_px[view].numpy().T
-        x, _, z = CAMERAS.centers[view].tolist()
-        on_leaf = x + rays[..., 0] * (0.4 - z) / rays[..., 2]  # where the ray meets the leaf's plane
-        is_right = (labels == 1) & (on_leaf > 0.1 * (view % 3 - 1))
-        labels[is_right] = 11 if view in views else 0
-    return maps
 
 
 def pieces_of_others(maps: list[np.ndarray]) -> list[np.ndarray]:
