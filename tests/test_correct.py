@@ -33,7 +33,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.known import match_given
 from mvseg.pipeline.run_scene import run_scene
-from mvseg.reconstruction.surface.kept_surfaces import name_instance
+from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
@@ -212,7 +212,7 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
     assert outcomes == [""]
     one, other = (  # the page keeps the numbers that the result has had
-        {name_instance(masks.regions, masks.instance_ids == leaf) for leaf in (1, 2, 3)}
+        {tuple(sorted(name_each(masks.regions.select(masks.instance_ids == leaf)))) for leaf in (1, 2, 3)}
         for masks in (shown.masks, run.masks)
     )
     assert one == other

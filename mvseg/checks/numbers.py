@@ -94,9 +94,7 @@ class ImageNumbers:
     gamma: float = 2.2  # exponent of light in photos, about: blur mixes light, so edges are where it is halfway
     smooth_px: float = 4.0  # pixels over which light hardly changes, unlike ink and paper at an edge
     shift: int = 4  # limit: bits of a pixel's fraction in OpenCV's polygons
-    # Shapes in small drawn photos have 0.93 and more, noise in those of a grey print up to 0.72: a third less would
-    # take that, too, a third more would leave out every shape.
-    least_iou: float = 0.75  # IoU of a mask with the shape where it should be, at least
+    least_iou: float = 0.75  # IoU of a mask with its shape, at least: shapes have 0.93 and more, noise up to 0.72
 
 
 CAMERAS = CameraNumbers()

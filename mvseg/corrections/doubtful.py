@@ -49,7 +49,7 @@ class Doubt:
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
         found, expected: number of views that have a mask of the leaf, and that should; of "half", those that have half
             a mask, and that have any.
-        size: of what it is about, from 0 to 1: its area as a share of that of a usual mask, at most 1.
+        size: area of what it is about, as a share of that of a usual mask, at most 1.
         outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
             "missing", two or more of "leaf", those of "place" and "half", none of the others.
     """
@@ -88,7 +88,7 @@ def list_doubts(
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
         cameras: V cameras.
         left: candidates that were not chosen.
-        photos: of the views; None: nobody looks for places without masks.
+        photos: photos of the views; None: nobody looks for places without masks.
     """
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
@@ -151,7 +151,7 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
 
 
 def _usual_area(masks: Masks) -> float:
-    """The median of those that are matched; pixels."""
+    """The median area of the matched masks, pixels."""
     matched = masks.regions.areas[masks.instance_ids > 0].float()
     return max(float(matched.median()), 1.0) if len(matched) else 1.0
 

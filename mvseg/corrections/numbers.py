@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EditNumbers:
-    """What a file of corrections may hold, and which masks an edit is about."""
+    """What a file of corrections may hold, which masks an edit is about, and how a rough outline is refined."""
 
     most_bytes: int = 64 * 2**20  # limit: size of the file, at most
     most_edits: int = 10_000  # limit: edits of a file, and photos that it names, at most
@@ -20,11 +20,18 @@ class EditNumbers:
     most_covered: int = 3  # masks that an outline replaces without a word: two stems before a leaf make three pieces
     fine: int = 4  # limit: bits of a pixel's fraction, along a cut
     touches_px: int = 2  # gap between two masks of one leaf in one photo, at most, where they hang together
+    segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
+    around: float = 0.35  # margin around the rough outline that is part of it, as a share of its size
+    least_margin_px: float = 4.0  # the same in pixels of the photo, at least
+    least_pixels: int = 16  # pixels of that part within the rough outline, at least
+    rounds: int = 5  # rounds of GrabCut
+    least_leaf: float = 0.05  # size of the leaf, as a share of the rough outline's pixels, at least
+    tolerance_px: float = 1.0  # distance of the outline from the edge of the leaf, in pixels of the part, at most
 
 
 @dataclass(frozen=True)
 class DoubtNumbers:
-    """What a person is asked. Doubts are rough: they only sort questions."""
+    """What a person is asked, also of places that have the colour of leaves and no mask. Doubts only sort questions."""
 
     least: float = 0.3  # doubt from which a question is asked
     most: int = 200  # questions of a page, at most: it asks a few itself, and the others where a person clicks
@@ -33,7 +40,7 @@ class DoubtNumbers:
     lone: float = 0.6  # doubt of a mask that was matched to nothing, at most
     missing: float = 0.8  # doubt where a mask is missing, at most
     covered: float = 0.9  # doubt where a mask of another leaf is in the place of one, at most
-    unmasked: float = 0.8  # doubt of a place that has the colour of leaves, and no mask
+    unmasked: float = 0.8  # doubt of such a place
     open: float = 0.5  # unhidden share of a surface from which a view should show a mask; see `EVIDENCE.open_pixels`
     empty: float = 0.6  # share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # IoU of that part with a mask of another leaf from which the mask may be the missing one
@@ -43,33 +50,12 @@ class DoubtNumbers:
     half: float = 0.5  # size of a place beside a mask, as a share of the mask, from which this may show half a leaf
     least_halves: int = 3  # photos from which that is asked: one mask may as well touch another leaf
     most_places: int = 12  # places that one question shows, at most
-
-
-@dataclass(frozen=True)
-class UnmaskedNumbers:
-    """Places that have the colour of leaves, and no mask."""
-
-    most_px: int = 600  # limit: longer side of a photo that is looked at, at most
+    looked_px: int = 600  # limit: longer side of a photo in which places are looked for
     opening: int = 5  # width of a place in these pixels, at least: stems are thinner, and seams beside masks
     compact: float = 0.25  # square of its largest width, as a share of its area, at least: stems have less
     beside: int = 3  # distance between a mask and what it leaves out of its leaf, in these pixels, at most
     most_share: float = 0.2  # size of a place, as a share of the photo, at most: what is larger is the ground
 
 
-@dataclass(frozen=True)
-class OutlineNumbers:
-    """A rough box or line around a leaf that becomes its outline."""
-
-    longest_px: int = 480  # limit: longer side of the part of the photo that is segmented
-    around: float = 0.35  # margin around the rough outline that is segmented, too, as a share of its size
-    least_margin_px: float = 4.0  # the same in pixels of the photo, at least
-    least_pixels: int = 16  # pixels of that part within the rough outline, at least
-    rounds: int = 5  # rounds of GrabCut
-    least: float = 0.05  # size of the leaf, as a share of the rough outline's pixels, at least
-    tolerance_px: float = 1.0  # distance of the outline from the edge of the leaf, in pixels of the part, at most
-
-
 EDITS = EditNumbers()
 DOUBTS = DoubtNumbers()
-UNMASKED = UnmaskedNumbers()
-OUTLINE = OutlineNumbers()

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.corrections.numbers import OUTLINE
+from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 
 Points = NDArray[np.float64]
@@ -31,27 +31,27 @@ def refine_outline(photo: NDArray[np.uint8], rough: Points) -> Points:
     """
     height, width = photo.shape[:2]
     low, high = rough.min(0), rough.max(0)
-    margin = max(OUTLINE.around * float((high - low).max()), OUTLINE.least_margin_px)
+    margin = max(EDITS.around * float((high - low).max()), EDITS.least_margin_px)
     x1, y1 = np.clip(np.floor(low - margin), 0, (width, height)).astype(int).tolist()
     x2, y2 = np.clip(np.ceil(high + margin), 0, (width, height)).astype(int).tolist()
     if min(x2 - x1, y2 - y1) < 2:
         raise InputError("the rough outline is not in the photo, expected one around a leaf")
-    scale = min(1.0, OUTLINE.longest_px / max(x2 - x1, y2 - y1))
+    scale = min(1.0, EDITS.segmented_px / max(x2 - x1, y2 - y1))
     part = cv2.resize(photo[y1:y2, x1:x2], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     inside = np.zeros(part.shape[:2], np.uint8)
     cv2.fillPoly(inside, [np.round((rough - (x1, y1)) * scale - 0.5).astype(np.int32)], 1)
-    if inside.sum() < OUTLINE.least_pixels or inside.all():
+    if inside.sum() < EDITS.least_pixels or inside.all():
         raise InputError("the rough outline is too small or as large as the photo, expected one around a leaf")
     state = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-    how = OUTLINE.rounds, cv2.GC_INIT_WITH_MASK
+    how = EDITS.rounds, cv2.GC_INIT_WITH_MASK
     cv2.grabCut(part, state, None, background, foreground, *how)  # type: ignore[call-overload]
     leaf = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.uint8)
     leaf = cv2.morphologyEx(leaf, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     lines, _ = cv2.findContours(leaf, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     largest = max(lines, key=cv2.contourArea, default=None)
-    if largest is None or cv2.contourArea(largest) < OUTLINE.least * inside.sum():
+    if largest is None or cv2.contourArea(largest) < EDITS.least_leaf * inside.sum():
         raise InputError("nothing inside differs from what is around it, expected an outline drawn by hand here")
-    corners = cv2.approxPolyDP(largest, OUTLINE.tolerance_px, True)[:, 0]
+    corners = cv2.approxPolyDP(largest, EDITS.tolerance_px, True)[:, 0]
     return np.asarray((corners + 0.5) / scale + (x1, y1), dtype=np.float64)

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.corrections.numbers import UNMASKED
+from mvseg.corrections.numbers import DOUBTS
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
-from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.leaf_color import has_leaf_color, thin_views
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -24,7 +24,7 @@ class Unmasked:
 
     Attributes:
         view: index of the view.
-        row: of the mask that it touches, with the longest border; -1 for none.
+        row: row of the mask that it shares its longest border with, -1 for none.
         area: pixels.
         outline: (P, 2) float64 pixels, undistorted.
     """
@@ -42,16 +42,11 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
 
     Args:
         masks: D masks on the CPU, matched.
-        photos: of the views.
+        photos: photos of the views.
     """
     if not masks.num_instances:
         return []
-    views = [_thin(masks, photos(view), view) for view in range(masks.regions.num_views)]
-    leaf = np.append(masks.instance_ids.numpy() > 0, False)  # the last one is for row -1
-    counts = ColorCounts.none()
-    for photo, rows, _ in views:
-        counts += count_colors(photo, leaf[rows])
-    colors = leaf_colors(counts)
+    views, colors = thin_views(masks, photos, most_px=DOUBTS.looked_px)
     return [
         part
         for view, (photo, rows, step) in enumerate(views)
@@ -60,29 +55,18 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
     ]
 
 
-def _thin(masks: Masks, photo: NDArray[np.uint8], view: int) -> tuple[NDArray[np.uint8], Ints, int]:
-    """Every `step`-th pixel of a view: the photo, and the row of the mask there, -1 for none."""
-    height, width = photo.shape[:2]
-    step = -(-max(width, height) // UNMASKED.most_px)
-    rows = np.full((height, width), -1)
-    for row in (masks.view_index == view).nonzero()[:, 0].tolist():
-        crop = masks.regions.placed(row)
-        crop.cut(rows)[crop.pixels.numpy()] = row
-    return np.ascontiguousarray(photo[::step, ::step]), rows[::step, ::step], step
-
-
 def _parts(is_free: Bools, rows: Ints, *, view: int, step: int) -> Iterator[Unmasked]:
-    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((UNMASKED.opening,) * 2, np.uint8))
+    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((DOUBTS.opening,) * 2, np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
-    (height, width), beside = rows.shape, UNMASKED.beside
+    (height, width), beside = rows.shape, DOUBTS.beside
     for label in range(1, count):
         left, top, wide, high, area = stats[label].tolist()
         is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
-        if not is_inside or area > UNMASKED.most_share * rows.size:
+        if not is_inside or area > DOUBTS.most_share * rows.size:
             continue
         box = np.s_[max(top - beside, 0) : top + high + beside, max(left - beside, 0) : left + wide + beside]
         part = (labels[box] == label).astype(np.uint8)
-        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < UNMASKED.compact * area:
+        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < DOUBTS.compact * area:
             continue
         touched = rows[box][cv2.dilate(part, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0]
         found, numbers = np.unique(touched[touched >= 0], return_counts=True)

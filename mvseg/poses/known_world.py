@@ -37,7 +37,7 @@ class Placement:
 
     Attributes:
         similarity: world_from_scene.
-        unit: of the world.
+        unit: name of the unit of the world.
         source: where the scale comes from, as text; "" if nowhere.
         residual: root mean square residual, in units of the world; None if unknown.
         left_out: names of photos whose positions contradict the others.
@@ -143,7 +143,7 @@ def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str) -> P
     corners = _marker_corners(scene) if any(name.startswith(MARKER) for name in names) else {}
     first, second = (_point(scene, name, corners) for name in names)
     apart = float(np.linalg.norm(first - second))
-    if apart <= 1e-9 * float(spreads(scene.cameras.centers.cpu().numpy())[0]):
+    if apart <= WORLD.rounding * float(spreads(scene.cameras.centers.cpu().numpy())[0]):
         raise InputError(f"{names[0]} and {names[1]} are at one place, expected two that are {length:g} apart")
     return Placement(
         similarity=scale_by(length / apart),

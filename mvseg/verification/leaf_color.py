@@ -69,6 +69,30 @@ def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
     return counted.astype(np.int64)
 
 
+def thin_views(
+    masks: Masks, photos: ReadPhoto, *, most_px: int
+) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], np.ndarray]:
+    """Every `step`-th pixel of V views, so that longer sides have `most_px` or fewer; and the colours of leaves there.
+
+    Returns:
+        V of (h, w, 3) the photo, (h, w) the row of the mask there, -1 for none, and `step`; and the `leaf_colors` by
+        all masks that are matched.
+    """
+    is_leaf = np.append(masks.instance_ids.numpy() > 0, False)  # the last one is for row -1
+    views, counts = [], ColorCounts.none()
+    for view in range(masks.regions.num_views):
+        photo = photos(view)
+        height, width = photo.shape[:2]
+        step = -(-max(height, width) // most_px)
+        rows = np.full((height, width), -1)
+        for row in (masks.view_index == view).nonzero()[:, 0].tolist():
+            crop = masks.regions.placed(row)
+            crop.cut(rows)[crop.pixels.numpy()] = row
+        views.append((np.ascontiguousarray(photo[::step, ::step]), rows[::step, ::step], step))
+        counts += count_colors(views[-1][0], is_leaf[views[-1][1]])
+    return views, leaf_colors(counts)
+
+
 def colors_of_leaves(masks: Masks, photos: ReadPhoto) -> NDArray[np.bool_]:
     """The colours of masks that are surely matched; where there are none, those of all that are matched."""
     is_matched = masks.instance_ids > 0

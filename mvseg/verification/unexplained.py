@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
-from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.leaf_color import has_leaf_color, thin_views
 from mvseg.verification.numbers import COLORS, EVIDENCE
 
 HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct); or give masks (--masks)"
@@ -30,20 +28,9 @@ def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
         masks: D masks, those of leaves with an id.
         photos: of the views; every second, third ... pixel of large ones counts.
     """
-    counts, views = ColorCounts.none(), []
-    for view in range(masks.regions.num_views):
-        photo = photos(view)
-        height, width = photo.shape[:2]
-        step = -(-max(height, width) // EVIDENCE.most_px)
-        inside = masks.regions.label_map(view, (masks.instance_ids > 0).long(), (width, height)).numpy() > 0
-        views.append((np.ascontiguousarray(photo[::step, ::step]), inside[::step, ::step]))
-        counts += count_colors(*views[-1])
-    colors, total, beside = leaf_colors(counts), 0, 0
-    for photo, inside in views:
-        is_leaf = has_leaf_color(photo, colors) | inside
-        total += int(is_leaf.sum())
-        beside += int((is_leaf & ~inside).sum())
-    return beside / max(total, 1)
+    views, colors = thin_views(masks.select(masks.instance_ids > 0), photos, most_px=EVIDENCE.most_px)
+    beside = sum(int((has_leaf_color(photo, colors) & (rows < 0)).sum()) for photo, rows, _ in views)
+    return beside / max(beside + sum(int((rows >= 0).sum()) for _, rows, _ in views), 1)
 
 
 def is_familiar(masks: Masks, *, sure_score: float) -> bool:

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvseg.reconstruction.surface.kept_surfaces import fit_kept, name_each, name_instance
+from mvseg.reconstruction.surface.kept_surfaces import fit_kept, name_each
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -74,4 +74,3 @@ def test_names_are_those_of_contents() -> None:
     names = name_each(REGIONS)
     assert len({*names}) == len(REGIONS)
     assert name_each(REGIONS.select(torch.tensor([2, 0]))) == [names[2], names[0]]
-    assert len({name_instance(REGIONS, each == IDS) for each in IDS.unique()}) == len(IDS.unique())

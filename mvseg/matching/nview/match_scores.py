@@ -129,6 +129,6 @@ def match_scores(evidence: IdEvidence) -> Floats:
     return np.where(evidence.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)
 
 
-def _log_odds(probability: Floats, most: float) -> Floats:
+def _log_odds(probability: Floats | float, most: float) -> Floats:
     clipped = np.clip(probability, 1 - most, most)
     return np.log(clipped / (1 - clipped))

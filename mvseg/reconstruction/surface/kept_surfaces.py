@@ -27,8 +27,8 @@ def fit_kept(
     is_rough: bool = False,
 ) -> dict[int, LeafSurface]:
     """As `fit_surfaces`; where the run keeps what it computed, see `running`, only the instances that it has not fitted
-    yet to the same masks, with the same cameras and options. (A surface also depends a little on what may hide it: it
-    is that of the first time.)
+    yet to the same masks, with the same cameras and options. A surface also depends a little on the masks of other
+    instances, which may hide it: the one that was fitted first is kept when only these change.
 
     Args:
         regions: D regions.
@@ -59,11 +59,6 @@ def fit_kept(
 def name_fit(regions: Regions, cameras: Cameras, *, how: str) -> str:
     """A name of a surface that is fitted to these masks, with these cameras, in the way that `how` says."""
     return json.dumps([_digest(cameras.px_from_world), how, sorted(name_each(regions))])
-
-
-def name_instance(regions: Regions, is_member: Tensor) -> str:
-    """A name that two instances share only if they have the same masks in the same views; `is_member` (D,) bool."""
-    return json.dumps(sorted(name_each(regions.select(is_member))))
 
 
 def name_each(regions: Regions) -> list[str]:
