@@ -97,10 +97,10 @@ def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int6
 
 
 def _block(values: Floats, one: NDArray[np.int64], other: NDArray[np.int64]) -> Floats:
-    """Of all pairs between two groups."""
+    """The values of all pairs between two groups."""
     return np.asarray(values[np.ix_(one, other)].ravel())
 
 
 def _upper(values: Floats, members: NDArray[np.int64]) -> Floats:
-    """Of all pairs within a group."""
+    """The values of all pairs within a group."""
     return np.asarray(values[np.ix_(members, members)][np.triu_indices(len(members), 1)])

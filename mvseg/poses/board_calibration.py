@@ -33,7 +33,7 @@ class TurntableCalibration:
         cameras: by name; their lengths are in the unit of the board.
         angles: (A,) degrees by which the table has turned, as turntable files count; NaN where none sees the board.
         residual_px: root mean square reprojection error of the corners.
-        num_corners: of the board, in all photos.
+        num_corners: number of corners of the board, in all photos together.
     """
 
     cameras: dict[str, TableCamera]

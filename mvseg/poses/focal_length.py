@@ -58,8 +58,8 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
 
 
 def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: int) -> float:
-    """Of the focal length that an adjustment finds which takes the principal point as it is; `covariance` is of all
-    numbers of the camera, the principal point free."""
+    """Pixels, standard deviation of the focal length that an adjustment with a fixed principal point finds;
+    `covariance` is that of all numbers of the camera, with a free one."""
     principal = camera.principal_point_idxs()
     gain = np.linalg.solve(covariance[np.ix_(principal, principal)], covariance[principal, focal])
     variance = covariance[focal, focal] - gain @ covariance[principal, focal]
@@ -68,7 +68,7 @@ def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: 
 
 
 def _covariance(model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
-    """Of all parameters, for residuals of 1 pixel; None where they are not determined."""
+    """The covariance of all parameters, for residuals of 1 pixel; None where they are not determined."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)

@@ -37,7 +37,7 @@ class Structure:
         model: COLMAP's reconstruction of the registered photos; images have the names of the photos.
         registered: names of the photos with a pose, in the order of all photos.
         left_out: names of the others.
-        plain: of all photos, names of those with so few features that nothing could register them.
+        plain: names of the photos with so few features that nothing could register them.
         other_models: number of further photos in each of the other models, which have frames of their own.
     """
 

@@ -48,7 +48,7 @@ def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = STR
         photo: (H, W, 3) uint8 RGB.
         image_size: a photo whose longer side has more pixels is scaled down to it.
         most: number of features that are kept.
-        contrast: the least of a feature.
+        contrast: least contrast of a feature.
     """
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     factor = min(1.0, image_size / max(grey.shape))

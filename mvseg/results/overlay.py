@@ -11,11 +11,11 @@ import numpy as np
 from mvseg.masks import SURE, Masks
 from mvseg.results.scale_bar import ScaleBar
 
-MAX_SIDE = 1600  # pixels of an overlay's longer side
+MAX_SIDE = 1600  # pixels of an overlay's longer side, at most
 MARGIN = 0.06  # margin around the plant in a picture, as a share of its longer side
 LEAST_SHARE = 0.05  # width of a picture as a share of the photo's, at least: a photo has no more detail
 UNMATCHED = (150, 150, 150)
-CAPITAL = 26  # height of a digit at scale 1, pixels
+CAPITAL = 26  # pixels of the height of OpenCV's digits at scale 1
 
 Box = tuple[int, int, int, int]
 _Number = tuple[str, tuple[int, int], float]  # text, column and row of its middle, radius of the circle that fits there

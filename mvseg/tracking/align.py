@@ -78,7 +78,7 @@ class Poses:
     Attributes:
         pair: the dates.
         refined: H.
-        gains: (H,) theirs, less what large new leaves cost.
+        gains: (H,) their gains, less what large new leaves cost.
         near: (H,) in [0, 1], how near they are to "as it stood".
     """
 
@@ -141,8 +141,8 @@ def guess_chance(gain: float, leaves: int) -> float:
     Args:
         gain: see `link_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
             others of the two dates says nothing more.)
-        leaves: of the date with fewer, >= 1. What they say is neither independent, then the sum would count, nor all
-            the same, then the mean would: the sum counts over the root of their number.
+        leaves: number of leaves of the date with fewer, >= 1. What they say is neither independent, then the sum would
+            count, nor all the same, then the mean would: the sum counts over the root of their number.
     """
     offset, own, strange = GUESS
     return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
@@ -248,7 +248,7 @@ def refine(pair: Pair, pose: Floats) -> Alignment:
         pairs = best_pairs(costs)
         if not len(pairs) or np.array_equal(pairs, before):
             break
-        # as if nobody had said it
+        # what the pairs weigh as if nobody had said that they are one leaf
         own = np.maximum(pair.said - costs, np.where(pair.said < 0, ALIGN.least_weight, 0.0))
         pose = _fit(pair, pairs, own[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
     else:

@@ -23,10 +23,10 @@ class LeafScores:
     """Log odds are the sum of the features times their weights, which are in the order of the features.
 
     Attributes:
-        shows: of a mask, to show a candidate with a surface: see `shows_features`.
-        matched: the same of one without: see `matched_features`.
-        leaf: of a candidate with a surface, to be a leaf: see `leaf_features`.
-        found: the same of one without, by the first four of these features.
+        shows: weights for a mask to show a candidate with a surface: see `shows_features`.
+        matched: the same for a candidate without one: see `matched_features`.
+        leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
+        found: the same for a candidate without one, by the first four of these features.
     """
 
     shows: dict[str, float]
@@ -77,7 +77,7 @@ class Candidates:
 
     @cached_property
     def lengths(self) -> Floats:
-        """(K,) of the surfaces, world units; NaN for none."""
+        """(K,) lengths of the surfaces, world units; NaN for none."""
         return np.array([np.nan if each is None else each.length for each in self.surfaces], float)
 
     @cached_property
@@ -174,7 +174,7 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
 
 
 def log_odds(values: Floats) -> Floats:
-    """Of shares and scores; NaN, of a mask that no detector scored, counts as one half."""
+    """Log odds of shares and scores; NaN, for a mask that no detector scored, counts as one half."""
     least = CHOICE.least_distance
     odds: Floats = logit(np.clip(np.nan_to_num(values, nan=0.5), least, 1 - least))
     return odds

@@ -111,12 +111,12 @@ class LeafSurface:
 
     @cached_property
     def length(self) -> float:
-        """Along the midrib from base to tip."""
+        """Length along the midrib from base to tip."""
         return measure_sizes(self.coefficients.numpy())[1]
 
     @cached_property
     def width(self) -> float:
-        """From edge to edge along the surface, at the widest place."""
+        """Width from edge to edge along the surface, at the widest place."""
         return measure_sizes(self.coefficients.numpy())[2]
 
     @cached_property

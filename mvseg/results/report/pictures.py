@@ -15,13 +15,13 @@ from mvseg.formats.image_file import encode_jpeg
 from mvseg.masks import SURE, Masks
 from mvseg.results.overlay import Box, find_plant, find_thickest
 
-LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # pixels of a picture
-ALL_PIXELS = 24_000_000  # of all pictures together: 4 to 9 MB, large enough to correct masks in
-THUMBNAIL_WIDTH = 320  # also shown around the picture of the plant
-QUALITY = 80  # of JPEGs
-UNITS = 2000  # across the picture of a view: the numbers of its outlines are whole ones
-TOLERANCE = 1.5  # units that an outline may differ from the mask
-LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # units, of a number in the picture
+LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # pixels of a picture, at most and at least
+ALL_PIXELS = 24_000_000  # pixels of all pictures together, at most: 4 to 9 MB, large enough to correct masks in
+THUMBNAIL_WIDTH = 320  # pixels of a thumbnail, which is also shown around the picture of the plant
+QUALITY = 80  # quality of JPEG pictures
+UNITS = 2000  # units across the picture of a view: the numbers of its outlines are whole ones
+TOLERANCE = 1.5  # distance of an outline from the edge of its mask, in units, at most
+LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # units of the height of a number in the picture, at least and at most
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,10 @@ class MaskContour:
     Attributes:
         region: index of the mask.
         leaf: id of its instance, -1 = matched to nothing.
-        path: of SVG; holes are paths of their own (even-odd rule).
+        path: SVG path; holes are paths of their own (even-odd rule).
         box: xyxy, around all of it.
         at: where its number goes: the middle of the thickest place.
-        height: of the number.
+        height: height of its number.
         match_score: see `Matching`.
         is_sure: whether that is at least 0.5.
         other: id of a second instance that the mask seems to cover, None for most.
@@ -60,7 +60,7 @@ class Picture:
         thumbnail: JPEG of the whole photo.
         box: xyxy of that part, in shares of the photo's width and height.
         proportion: its height / width.
-        outlines: of the masks.
+        outlines: outlines of the masks.
     """
 
     jpeg: bytes

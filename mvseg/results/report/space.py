@@ -28,8 +28,8 @@ from mvseg.traits.up import level_frame
 Floats = NDArray[np.float64]
 
 MESH_SHAPE = (24, 9)  # grid of a surface: 352 triangles
-VOXEL_FACES = 700  # triangles of a leaf of voxels
-STEPS = 32767  # of a coordinate from 0 to 1: 16 bits
+VOXEL_FACES = 700  # triangles of a leaf of voxels, at most
+STEPS = 32767  # steps of a coordinate from 0 to 1: 16 bits
 PLANT_SHARE = 0.25  # radius of a plant without shapes, as a share of the distance of its cameras
 LEVEL = 0.3  # length of the mean up vector of the cameras, from which it is used as that of the plant
 
@@ -40,8 +40,8 @@ class Frame:
 
     Attributes:
         rotation: (3, 3) float64, rows are the page's axes in the world.
-        middle: (3,) float64, of the plant, turned.
-        radius: of the plant, world units, > 0.
+        middle: (3,) float64, middle of the plant, turned.
+        radius: radius of the plant, world units, > 0.
         is_up_known: whether +y is the scene's up, and not just that of most photos.
     """
 
