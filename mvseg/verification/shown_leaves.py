@@ -43,7 +43,7 @@ class GivenScores:
 # first fit said: a right mask that is lost is worse than one that is not won.
 GIVEN = GivenScores(
     shows={"surface": 1.962, "match score": 0.359, "matched to another": -1.66, "visible": 1.214, "within": 0.764,
-           "no surface": 1.007, "match score without": 0.866},
+           "no surface": 1.007, "match score, no surface": 0.866},
     price=6.1,
 )  # fmt: skip
 
