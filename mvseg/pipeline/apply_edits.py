@@ -15,7 +15,7 @@ from mvseg.matching.match import describe_disagreement, match_masks
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
-from mvseg.verification.choose import add_beside, choose_leaves
+from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
 
 NOTHING_LEFT = "the corrections reject every mask: no leaf is left"
@@ -24,20 +24,20 @@ NOTHING_LEFT = "the corrections reject every mask: no leaf is left"
 def apply_edits(known: Known, corrections: Corrections | None) -> Known:
     """What a person says changes masks and links them, and these are matched anew, see `mvseg.corrections.apply`.
 
-    Edits are about masks that a person sees: those that were given, or those that the views chose, and what else was
-    surely detected beside these. Without any edits, all stays as it is.
+    Edits are about masks that a person sees, see `Known.shown`. Without any edits, all stays as it is. The reprojection
+    error is that of the masks before edits, unless a person drew more than half as many as there were.
     """
     if corrections is None or not corrections.edits:
         return known
     opened, cameras, config = known.opened, known.scene.cameras, known.opened.config
-    shown = known.masks if opened.given is None else known.proposals
-    if opened.is_chosen:
-        shown = add_beside(known.masks, known.matched[0], cameras)
     with timed("correct"):
+        shown = known.shown
         corrected = apply(corrections, shown, known.scene)
     with timed("match"):
         corrected = link_halves(corrected, known.masks.to("cpu"), cameras.to("cpu"))
-        matching = match_masks(corrected.masks, cameras, config.match, links=corrected.links)
+        is_known = 2 * int(corrected.masks.is_corrected.sum()) <= len(known.masks)  # else his masks tell it better
+        residual_px = known.matching.report.residual_px if is_known else None
+        matching = match_masks(corrected.masks, cameras, config.match, links=corrected.links, residual_px=residual_px)
     masks, corrected = apply_everywhere(corrected, matching.masks.to("cpu"))
     if len(shown) and not len(masks):
         warn(NOTHING_LEFT)
@@ -67,6 +67,7 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
             cameras=cameras,
             more=known.matched,
             gone=_taken_away(shown, masks),
+            drawn=known.drawn,
             min_probability=config.detect.min_probability,
         )
     return edited.with_leaves(leaves)

@@ -19,7 +19,8 @@ from mvseg.poses.refine_poses import RefinedPoses, refine_scene
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
-from mvseg.verification.choose import expect_right
+from mvseg.verification.choose import add_beside, expect_right
+from mvseg.verification.evidence import Drawn, draw_views
 from mvseg.verification.leaf_color import colors_of_leaves
 
 if TYPE_CHECKING:
@@ -70,6 +71,19 @@ class Known:
     def expected_right(self) -> float:
         """E, see `expect_right`."""
         return expect_right(self.masks, self.instances.probabilities)
+
+    @cached_property
+    def shown(self) -> Masks:
+        """The masks that a person sees, and edits: those that were given, or those that the views chose, and what else
+        was surely detected beside these."""
+        if self.opened.is_chosen:
+            return add_beside(self.masks, self.matched[0], self.scene.cameras)
+        return self.masks if self.opened.given is None else self.proposals
+
+    @cached_property
+    def drawn(self) -> tuple[Drawn, ...]:
+        """V views of the proposals, see `draw_views`."""
+        return draw_views(self.proposals.regions, (), self.scene.cameras.to("cpu"))
 
     @cached_property
     def leaf_colors(self) -> NDArray[np.bool_]:

@@ -70,6 +70,7 @@ def choose_leaves(
     cameras: Cameras,
     more: Sequence[Masks] = (),
     gone: Masks | None = None,
+    drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
@@ -85,6 +86,7 @@ def choose_leaves(
         more: masks of other matchings, of more of the proposals, with such labels, too.
         gone: masks that a person took away; None: nobody edited the masks. Otherwise only the instances of a person's
             masks are candidates here, and `more` has the others.
+        drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
     Returns:
@@ -108,9 +110,9 @@ def choose_leaves(
         matched = replace(matched, instance_ids=ids.where(torch.isin(ids, ids[is_held]), -1))
     found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
-    drawn = draw_views(table.regions, candidates.surfaces, cameras)
+    seen = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
     usable = np.concatenate((left, np.ones(len(added), bool)))
-    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
+    chosen = choose(candidates, table, drawn=seen, usable=usable, min_probability=min_probability)
     return _take(chosen, candidates, table, is_held=held)
 
 

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, hstack
 
 from mvseg.crop import Crop
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -28,7 +28,6 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
-
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """One view: N masks and K surfaces, as the pixels (P,) of the thinned photo that they cover.
@@ -38,12 +37,14 @@ class Drawn:
         masks: (P, N) int32 of 0 and 1.
         parts: (P, K) int32, what the surfaces cover as if nothing hid them.
         depth: (K,) of their middles, world units; infinite without a surface.
+        first: the first masks alone, where they were drawn before; None: none of them.
     """
 
     rows: Ints
     masks: csc_array
     parts: csc_array
     depth: Floats
+    first: Drawn | None = None
 
     @cached_property
     def common(self) -> Floats:
@@ -54,9 +55,10 @@ class Drawn:
     @cached_property
     def is_shared(self) -> Bools:
         """(N, N) whether one covers more than `EVIDENCE.shared` of the smaller one of two masks."""
-        areas, both = self.masks.sum(0), (self.masks.T @ self.masks).toarray()
-        is_shared: Bools = both > EVIDENCE.shared * np.maximum(np.minimum(areas[:, None], areas), 1)
-        return is_shared
+        known = 0 if self.first is None else len(self.first.rows)
+        areas, both = self.masks.sum(0), (self.masks.T @ self.masks[:, known:]).toarray()
+        new: Bools = both > EVIDENCE.shared * np.maximum(np.minimum(areas[:, None], areas[known:]), 1)
+        return new if self.first is None else np.block([[self.first.is_shared, new[:known]], [new.T]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,8 +81,11 @@ class Evidence:
     share: Floats
 
 
-def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
-    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
+def draw_views(
+    regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras, *, first: Sequence[Drawn] = ()
+) -> tuple[Drawn, ...]:
+    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out. `first`: the first of
+    the regions, where these were drawn before; they are not drawn again."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
     shown = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
@@ -88,9 +93,13 @@ def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras
         step = -(-max(width, height) // EVIDENCE.most_px)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         rows = (regions.view_index == view).nonzero()[:, 0].numpy()
-        masks = [regions.placed(row) for row in rows.tolist()]
-        pixels, covered = _columns(masks, size, step), _columns([parts[view] for parts in shown], size, step)
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view]))
+        known = first[view] if first else None
+        new = rows if known is None else rows[len(known.rows) :]
+        pixels = _columns([regions.placed(row) for row in new.tolist()], size, step)
+        if known is not None:
+            pixels = hstack((known.masks, pixels), format="csc")
+        covered = _columns([parts[view] for parts in shown], size, step)
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], first=known))
     return tuple(drawn)
 
 

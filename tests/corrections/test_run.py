@@ -19,7 +19,12 @@ from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, load_corrections, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
 from mvseg.masks import Masks, MergedMask, Origin
+from mvseg.matching.match import match_masks
+from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
+from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.known import match_given
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.results.folder import write_refined
 from mvseg.results.result import Result
 from mvseg.verification.checked_ids import check_ids
@@ -28,6 +33,7 @@ from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 IDS_ONLY = RunConfig(reconstruct=None)
+SQUARE = np.array([[-9.0, -9], [-9, 9], [9, 9], [9, -9]])
 
 
 def corrections(*edits: dict[str, Any]) -> Corrections:
@@ -79,6 +85,26 @@ def test_ids_follow_what_a_person_says(plant: Path) -> None:
     assert result.masks.is_corrected.sum() == 1
 
 
+def test_edits_do_not_estimate_the_reprojection_error_again(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int | None] = []
+
+    def match(*args: Any, residual_px: int | None = None, **options: Any) -> Matching:
+        asked.append(residual_px)
+        return match_masks(*args, residual_px=residual_px, **options)
+
+    monkeypatch.setattr("mvseg.pipeline.apply_edits.match_masks", match)
+    known = match_given(open_scene(plant, plant / "masks", IDS_ONLY))
+    outlines = {(view, ball): np.array(middle(plant, view, ball)) + SQUARE for view in range(4) for ball in (1, 2)}
+    drawn = [
+        {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()}
+        for (view, _), polygon in outlines.items()
+    ]
+    apply_edits(known, corrections({"op": "reject"} | at(plant, 0, 1)))
+    apply_edits(known, corrections(*drawn))
+    assert asked == [known.matching.report.residual_px, None]
+    assert asked[0] is not None
+
+
 def id_at(result: Result, plant: Path, view: int, ball: int) -> int:
     x, y = (int(each) for each in middle(plant, view, ball))
     labels = result.regions.label_map(view, torch.arange(1, len(result.masks) + 1), (128, 96))
@@ -127,9 +153,7 @@ def squares(masks: Masks) -> list[tuple[list[int], int]]:
 
 
 @pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])
-def test_no_later_stage_changes_or_drops_a_corrected_mask(
-    origin: Origin, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin, monkeypatch: pytest.MonkeyPatch) -> None:
     masks, stays = wrong_masks(origin), [([0, 0, 9, 9], 81)]
     regions, scores = replace(masks.regions, labels=torch.arange(len(masks))), torch.full((len(masks),), 0.8)
     numbered = replace(masks, regions=regions, detection_scores=scores)

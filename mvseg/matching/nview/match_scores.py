@@ -116,9 +116,9 @@ def scene_features(evidence: IdEvidence) -> Floats:
     """
     sure = 1 / (1 + np.exp(-(features(evidence) @ list(REGION.values()))))
     is_matched = evidence.num_partners > 0
-    mean = sure[is_matched].mean() if is_matched.any() else 0.0
+    mean = float(sure[is_matched].mean()) if is_matched.any() else 0.0
     agreement = evidence.agreement[is_matched].mean() if is_matched.any() else 0.0
-    region, scene = (_log_odds(x, most) for x, most in zip((sure, mean), SUREST, strict=True))
+    region, scene = _log_odds(sure, SUREST[0]), _log_odds(mean, SUREST[1])
     ones = np.ones(len(sure))
     return np.stack([ones, region, scene * ones, region * scene, agreement * ones], 1)
 
