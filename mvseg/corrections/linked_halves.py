@@ -13,14 +13,13 @@ import torch
 from torch import Tensor
 
 from mvseg.corrections.apply import Corrected
+from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
 from mvseg.reconstruction.surface.kept_surfaces import fit_kept, name_each
 from mvseg.scene import Cameras
 from mvseg.verification.join_halves import are_one_leaf
-
-LEAST_PHOTOS = 2  # photos that show both of two instances, from which they may be halves of a leaf
 
 
 def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Corrected:
@@ -46,7 +45,7 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
     is_linked = masks.is_linked
     for one, other in sorted({(min(pair), max(pair)) for pair in ids[links.must].tolist()}):
         halves = _in_one_photo(masks, ids == one, ids == other) if 0 < one < other else []
-        if len({int(masks.view_index[row]) for row, _ in halves}) < LEAST_PHOTOS:
+        if len({int(masks.view_index[row]) for row, _ in halves}) < EDITS.least_halves:
             continue
         own = torch.where(ids == one, 1, torch.where(ids == other, 2, -1))
         if are_one_leaf(masks.regions, own, fit_kept(masks.regions, own, cameras), cameras=cameras):
