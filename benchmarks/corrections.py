@@ -40,7 +40,7 @@ from benchmarks.simulated_person import (
     list_repairs,
 )
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import APPLIED
+from mvseg.corrections.corrected import APPLIED
 from mvseg.corrections.doubtful import list_doubts
 from mvseg.corrections.file import Corrections, Edit, load_corrections, write_corrections
 from mvseg.detection.cached_detections import CachedDetections

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import torch
 
-from mvseg.corrections.apply import apply, apply_everywhere
+from mvseg.corrections.apply import apply
+from mvseg.corrections.corrected import apply_everywhere
 from mvseg.corrections.file import Corrections, Edit
 from mvseg.masks import Masks
 from mvseg.matching.partition import separate_unmatched

@@ -1,7 +1,7 @@
 """Edits become masks and links.
 
 In the order of the list, each edit finds the masks that it points at as the edits before it left them. What concerns
-whole instances (`everywhere`) waits until they are known: see `apply_everywhere`.
+whole instances (`everywhere`) waits until they are known: see `mvseg.corrections.corrected.apply_everywhere`.
 """
 
 from __future__ import annotations
@@ -10,12 +10,13 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from mvseg.corrections.corrected import APPLIED, CONTRADICTED, NOTHING, PASSED, Corrected, Fate, Refused, Whole
 from mvseg.corrections.edited_mask import EditedMask, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.corrections.numbers import EDITS
@@ -29,78 +30,22 @@ from mvseg.matching.links import Links
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 
-APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
 
-
-@dataclass(frozen=True)
-class Fate:
-    """What came of an edit: its number from 1 on, its operation, and "applied", "points at nothing", "contradicted by
-    edit N" or, of links between dates, "not of a scene"; `problem` says which place it was, or why."""
+class _Tie(NamedTuple):
+    """What an edit says of two masks: that they must, or cannot, show one leaf."""
 
     edit: int
-    op: str
-    fate: str
-    problem: str = ""
-
-    @property
-    def message(self) -> str:
-        """A sentence, if the edit was not applied, or is odd; "" otherwise."""
-        if not self.problem and self.fate in (APPLIED, PASSED):
-            return ""
-        return f"correction {self.edit} ({self.op}): {': '.join(filter(None, (self.fate, self.problem)))}"
+    must: bool
+    one: EditedMask
+    other: EditedMask
 
 
-@dataclass(frozen=True)
-class Refused:
-    """A pixel where a person says that no leaf is, and where no mask is: it may be the answer to a question, see
-    `settle`.
-
-    Attributes:
-        edit: its number.
-        view, column, row: of the undistorted photo.
-        everywhere: no leaf in any photo.
-    """
+class _About(NamedTuple):
+    """An edit about the whole instance of a mask."""
 
     edit: int
-    view: int
-    column: int
-    row: int
-    everywhere: bool
-
-
-@dataclass(frozen=True)
-class Whole:
-    """An edit about a whole instance: its number, the row of a mask of it, and whether it is rejected, or confirmed."""
-
-    edit: int
-    row: int
+    mask: EditedMask
     rejects: bool
-
-
-@dataclass(frozen=True, eq=False)
-class Corrected:
-    """Masks as edits leave them.
-
-    Attributes:
-        masks: D masks on the CPU, by view, matched to nothing.
-        links: of their rows; those that no edit names keep outlines apart from what else their photos show.
-        last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
-        everywhere: the edits about whole instances.
-        refused: the pixels where a person says that no leaf is, and where no mask is.
-        fates: of the edits, in their order.
-    """
-
-    masks: Masks
-    links: Links
-    last_edits: Tensor
-    everywhere: tuple[Whole, ...]
-    refused: tuple[Refused, ...]
-    fates: tuple[Fate, ...]
-
-    @property
-    def messages(self) -> list[str]:
-        """A sentence for each edit that was not applied, or is odd."""
-        return [each.message for each in self.fates if each.message]
 
 
 @dataclass(eq=False)
@@ -110,15 +55,15 @@ class _Work:
     scene: Scene
     masks: list[EditedMask]
     fates: dict[int, Fate] = field(default_factory=dict)
-    links: list[tuple[int, bool, EditedMask, EditedMask]] = field(default_factory=list)  # edit, must, the two
-    everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
+    ties: list[_Tie] = field(default_factory=list)
+    everywhere: list[_About] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
     refused: list[Refused] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
-        return any(rejects and other is mask for _, other, rejects in self.everywhere)
+        return any(each.rejects and each.mask is mask for each in self.everywhere)
 
 
 class _Lost(Exception):
@@ -150,7 +95,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
             work.fates[number] = Fate(number, edit.op, NOTHING, str(error))
     for outlines in work.words.values():
         alive = [(number, mask) for number, mask in outlines if mask in work.masks]
-        work.links += [(number, True, alive[0][1], mask) for number, mask in alive[1:]]
+        work.ties += [_Tie(number, True, alive[0][1], mask) for number, mask in alive[1:]]
     _clear_outlines(work.masks)
     order = sorted(work.masks, key=lambda mask: mask.view)
     place = {mask: n for n, mask in enumerate(order)}
@@ -162,7 +107,9 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         _tell_of_parts(work, place, component)
         first = np.unique(component, return_index=True)[1]
         table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
-    everywhere = tuple(Whole(n, place[mask], rejects) for n, mask, rejects in work.everywhere if mask in place)
+    everywhere = tuple(
+        Whole(each.edit, place[each.mask], each.rejects) for each in work.everywhere if each.mask in place
+    )
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
     return Corrected(
         masks=table,
@@ -187,44 +134,6 @@ def is_on(edit: Edit, regions: Regions, rows: Sequence[int], *, scene: Scene) ->
     return False
 
 
-def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
-    """Edits about whole instances, once these are known, in the order of the list.
-
-    Args:
-        corrected: what came of all other edits.
-        matched: its masks with ids, in their order.
-
-    Returns:
-        The masks, with ids without gaps: those of a rejected instance go, but for those that later edits drew, cut or
-        confirmed; those of a confirmed one are confirmed. And the same with the final fates: such an edit contradicts
-        earlier ones that drew, cut or confirmed masks that now go, or that rejected what it confirms.
-    """
-    ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)  # the edit by which each mask goes
-    confirmed, last_edits = torch.zeros(len(matched), dtype=torch.bool), corrected.last_edits
-    overridden: dict[int, int] = {}
-    for each in corrected.everywhere:
-        number, row = each.edit, each.row
-        own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(confirmed)
-        own[row] = True
-        if each.rejects:
-            goes[own & (last_edits < number)] = number
-        else:
-            overridden |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
-            goes[own] = 0
-            confirmed |= own
-    rows = zip(last_edits.tolist(), goes.tolist(), strict=True)
-    overridden |= {last: number for last, number in rows if 0 < last < number}
-    fates = tuple(
-        replace(each, fate=CONTRADICTED.format(overridden[each.edit]))
-        if each.fate == APPLIED and each.edit in overridden
-        else each
-        for each in corrected.fates
-    )
-    origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
-    masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
-    return masks, replace(corrected, fates=fates)
-
-
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:
     if isinstance(edit, Outline):
         _outline(work, number, edit)
@@ -236,7 +145,7 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)
-            work.everywhere.append((number, mask, True))
+            work.everywhere.append(_About(number, mask, True))
         else:
             _remove(work, number, mask)
             work.rejected.append((number, mask))
@@ -245,7 +154,7 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         mask.origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
         mask.edits.append(number)
         if edit.everywhere:
-            work.everywhere.append((number, mask, False))
+            work.everywhere.append(_About(number, mask, False))
     elif isinstance(edit, Split):
         _split(work, number, edit)
     elif isinstance(edit, Link):
@@ -300,7 +209,7 @@ def _split(work: _Work, number: int, edit: Split) -> None:
     parts = [EditedMask(mask.view, half.tighten(), mask.row, int(Origin.CUT), [number]) for half in halves]
     _remove(work, number, mask)
     work.masks += parts
-    work.links.append((number, False, parts[0], parts[1]))
+    work.ties.append(_Tie(number, False, parts[0], parts[1]))
 
 
 def _link(work: _Work, number: int, edit: Link) -> None:
@@ -309,11 +218,11 @@ def _link(work: _Work, number: int, edit: Link) -> None:
     for mask in masks:
         mask.edits.append(number)
     if edit.op == "same":
-        work.links += [(number, True, masks[0], mask) for mask in masks[1:]]
+        work.ties += [_Tie(number, True, masks[0], mask) for mask in masks[1:]]
     elif len(masks) < len(found):
         raise _Lost("two of its places show the same mask: split it")
     else:
-        work.links += [(number, False, one, other) for n, one in enumerate(masks) for other in masks[:n]]
+        work.ties += [_Tie(number, False, one, other) for n, one in enumerate(masks) for other in masks[:n]]
 
 
 def _tell_of_parts(work: _Work, place: dict[EditedMask, int], component: NDArray[np.int64]) -> None:
@@ -322,7 +231,7 @@ def _tell_of_parts(work: _Work, place: dict[EditedMask, int], component: NDArray
     for mask, row in place.items():
         groups.setdefault((int(component[row]), mask.view), []).append(mask)
     for (group, view), masks in groups.items():
-        edits = [n for n, m, a, _ in work.links if m and a in place and component[place[a]] == group]
+        edits = [tie.edit for tie in work.ties if tie.must and tie.one in place and component[place[tie.one]] == group]
         if edits and not hang_together(masks):
             message = f"a contradiction: its masks in view {work.scene.views[view].name} do not touch"
             work.fates[max(edits)] = replace(work.fates[max(edits)], problem=message)
@@ -331,17 +240,20 @@ def _tell_of_parts(work: _Work, place: dict[EditedMask, int], component: NDArray
 def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
     """The links that hold, of rows: the latest first, and none that contradicts those. The edit of one that does not
     hold is contradicted by the latest edit without which it would; or by itself."""
-    rows = [(n, m, place[a], place[b]) for n, m, a, b in work.links if a in place and b in place]
+    ties = [each for each in work.ties if each.one in place and each.other in place]
 
     def links_of(edits: Collection[int]) -> Links | None:
-        must, cannot = ([(a, b) for n, m, a, b in rows if n in edits and m is kind] for kind in (True, False))
+        said = [each for each in ties if each.edit in edits]
+        must, cannot = (
+            [(place[each.one], place[each.other]) for each in said if each.must is kind] for kind in (True, False)
+        )
         links = Links.of(must, cannot)
         with suppress(InputError):
             links.components(len(place))
             return links
         return None
 
-    edits = sorted({number for number, *_ in rows}, reverse=True)
+    edits = sorted({each.edit for each in ties}, reverse=True)
     if (links := links_of(edits)) is not None:
         return links
     held: list[int] = []
@@ -370,8 +282,9 @@ def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
 def _remove(work: _Work, number: int, mask: EditedMask) -> None:
     """Take a mask away; the edits that made it, or linked it, are contradicted."""
     work.masks.remove(mask)
-    linked = [n for n, _, a, b in work.links if mask in (a, b)] + [n for n, m, _ in work.everywhere if m is mask]
-    _contradict(work, number, [*mask.edits, *linked])
+    linked = [each.edit for each in work.ties if mask in (each.one, each.other)]
+    about = [each.edit for each in work.everywhere if each.mask is mask]
+    _contradict(work, number, [*mask.edits, *linked, *about])
 
 
 def _contradict(work: _Work, number: int, edits: Sequence[int]) -> None:
@@ -396,9 +309,9 @@ def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
         work.masks.append(gone[-1])
     mask = _mask_at(work, place)
     _contradict(work, number, [n for n, other in work.rejected if other is mask])
-    _contradict(work, number, [n for n, other, rejects in work.everywhere if rejects and other is mask])
+    _contradict(work, number, [each.edit for each in work.everywhere if each.rejects and each.mask is mask])
     work.rejected = [each for each in work.rejected if each[1] is not mask]
-    work.everywhere = [each for each in work.everywhere if each[1] is not mask or not each[2]]
+    work.everywhere = [each for each in work.everywhere if each.mask is not mask or not each.rejects]
     return mask
 
 

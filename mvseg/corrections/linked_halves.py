@@ -12,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from mvseg.corrections.apply import Corrected
+from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 from mvseg.masks import Masks

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from mvseg.corrections.apply import APPLIED, Fate, Refused
+from mvseg.corrections.corrected import APPLIED, Fate, Refused
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LeftOut

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from mvseg.corrections.apply import apply, apply_everywhere
+from mvseg.corrections.apply import apply
+from mvseg.corrections.corrected import apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.corrections.apply import Fate, Refused
+from mvseg.corrections.corrected import Fate, Refused
 from mvseg.masks import Masks
 from mvseg.matching.match import describe_disagreement, match_masks
 from mvseg.matching.result import Matching

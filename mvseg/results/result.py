@@ -14,7 +14,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
-    from mvseg.corrections.apply import Fate
+    from mvseg.corrections.corrected import Fate
     from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid

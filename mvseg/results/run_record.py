@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from mvseg._version import __version__
-from mvseg.corrections.apply import Fate
+from mvseg.corrections.corrected import Fate
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE

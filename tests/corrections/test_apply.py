@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere
+from mvseg.corrections.apply import apply
+from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.corrections.settle import settle
 from mvseg.formats.lens import distort, opencv_lens, undistort

@@ -13,7 +13,7 @@ import torch
 
 from blade_scene import as_regions
 from found_masks import FoundMasks, open_photos, see_masks
-from mvseg.corrections.apply import APPLIED
+from mvseg.corrections.corrected import APPLIED
 from mvseg.corrections.file import Corrections, Edit, Reject
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport

@@ -8,7 +8,7 @@ import torch
 
 from blade_scene import as_regions
 from known_leaves import flat_leaf
-from mvseg.corrections.apply import Corrected
+from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.linked_halves import link_halves
 from mvseg.masks import Masks
 from mvseg.matching.links import Links

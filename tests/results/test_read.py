@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from known_leaves import bent_blade, make_surface
 from mvseg import assert_same_result, load_result
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import Fate
+from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import Corrections, Reject
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_crop, decode_rle, encode_mask

@@ -14,7 +14,7 @@ from blade_scene import SIZE, as_regions
 from found_masks import FoundMasks, open_photos, see_masks
 from leafy_scene import write_leafy_scene
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import Fate
+from mvseg.corrections.corrected import Fate
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mvseg.corrections.apply import APPLIED, PASSED, Fate
+from mvseg.corrections.corrected import APPLIED, PASSED, Fate
 from mvseg.corrections.doubtful import Doubt, list_doubts
 from mvseg.corrections.file import dump_edits, name_edits
 from mvseg.corrections.same_scene import mark_photos

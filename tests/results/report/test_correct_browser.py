@@ -14,7 +14,7 @@ import pycolmap
 import pytest
 import torch
 
-from mvseg.corrections.apply import Fate
+from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import load_corrections, parse_corrections
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.results.report.page import write_report

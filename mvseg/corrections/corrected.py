@@ -1,0 +1,122 @@
+"""What edits leave: masks, links, and what came of each edit; and the edits about whole instances, which come last."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mvseg.masks import Masks, Origin
+from mvseg.matching.links import Links
+
+APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
+
+
+@dataclass(frozen=True)
+class Fate:
+    """What came of an edit: its number from 1 on, its operation, and "applied", "points at nothing", "contradicted by
+    edit N" or, of links between dates, "not of a scene"; `problem` says which place it was, or why."""
+
+    edit: int
+    op: str
+    fate: str
+    problem: str = ""
+
+    @property
+    def message(self) -> str:
+        """A sentence, if the edit was not applied, or is odd; "" otherwise."""
+        if not self.problem and self.fate in (APPLIED, PASSED):
+            return ""
+        return f"correction {self.edit} ({self.op}): {': '.join(filter(None, (self.fate, self.problem)))}"
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A pixel where a person says that no leaf is, and where no mask is: it may be the answer to a question, see
+    `settle`.
+
+    Attributes:
+        edit: its number.
+        view, column, row: of the undistorted photo.
+        everywhere: no leaf in any photo.
+    """
+
+    edit: int
+    view: int
+    column: int
+    row: int
+    everywhere: bool
+
+
+@dataclass(frozen=True)
+class Whole:
+    """An edit about a whole instance: its number, the row of a mask of it, and whether it is rejected, or confirmed."""
+
+    edit: int
+    row: int
+    rejects: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """Masks as edits leave them.
+
+    Attributes:
+        masks: D masks on the CPU, by view, matched to nothing.
+        links: of their rows; those that no edit names keep outlines apart from what else their photos show.
+        last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
+        everywhere: the edits about whole instances.
+        refused: the pixels where a person says that no leaf is, and where no mask is.
+        fates: of the edits, in their order.
+    """
+
+    masks: Masks
+    links: Links
+    last_edits: Tensor
+    everywhere: tuple[Whole, ...]
+    refused: tuple[Refused, ...]
+    fates: tuple[Fate, ...]
+
+    @property
+    def messages(self) -> list[str]:
+        """A sentence for each edit that was not applied, or is odd."""
+        return [each.message for each in self.fates if each.message]
+
+
+def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
+    """Edits about whole instances, once these are known, in the order of the list.
+
+    Args:
+        corrected: what came of all other edits.
+        matched: its masks with ids, in their order.
+
+    Returns:
+        The masks, with ids without gaps: those of a rejected instance go, but for those that later edits drew, cut or
+        confirmed; those of a confirmed one are confirmed. And the same with the final fates: such an edit contradicts
+        earlier ones that drew, cut or confirmed masks that now go, or that rejected what it confirms.
+    """
+    ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)  # the edit by which each mask goes
+    confirmed, last_edits = torch.zeros(len(matched), dtype=torch.bool), corrected.last_edits
+    overridden: dict[int, int] = {}
+    for each in corrected.everywhere:
+        number, row = each.edit, each.row
+        own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(confirmed)
+        own[row] = True
+        if each.rejects:
+            goes[own & (last_edits < number)] = number
+        else:
+            overridden |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
+            goes[own] = 0
+            confirmed |= own
+    rows = zip(last_edits.tolist(), goes.tolist(), strict=True)
+    overridden |= {last: number for last, number in rows if 0 < last < number}
+    fates = tuple(
+        replace(each, fate=CONTRADICTED.format(overridden[each.edit]))
+        if each.fate == APPLIED and each.edit in overridden
+        else each
+        for each in corrected.fates
+    )
+    origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
+    masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
+    return masks, replace(corrected, fates=fates)
