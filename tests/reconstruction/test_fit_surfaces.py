@@ -136,6 +136,7 @@ def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: 
     gone = LeafSurface.none(torch.arange(2), "a reason")
     again = fit_surfaces(regions, ids, cameras, known={1: both[1]})
     assert again[1] is both[1]
+    assert all(len(each.offsets_px) == len(each.views) for each in both.values())
     assert torch.allclose(again[2].points(), both[2].points(), atol=5e-3)
     assert again[2].area == pytest.approx(both[2].area, rel=2e-3)
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.carve_hull", None)

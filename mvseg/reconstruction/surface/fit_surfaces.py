@@ -60,7 +60,7 @@ def fit_surfaces(
         cameras: V cameras.
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
         known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
-            them: it hides what lies behind it, and its masks tell how all masks err.
+            them: it hides what lies behind it, and its `offsets_px` tell how all masks err.
         most_views: at least 2; None: `SEARCH.most_views`.
         is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err, and
             the reasons to doubt a surface.
@@ -82,23 +82,18 @@ def fit_surfaces(
     surfaces: dict[int, LeafSurface] = {}
     unfitted: dict[int, tuple[MaskStack, Floats | None]] = {}
     for instance in _ids(instance_ids):
+        if instance in known:
+            continue
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
-        if instance in known and (is_rough or not known[instance].exists):
-            continue
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
         most = most_views or SEARCH.most_views
-        kept = known[instance].views if instance in known else views[spread_views(cameras[views], most)]
-        members = members.select(torch.isin(members.view_index, kept))
-        stacks[instance] = _stack(members, cameras, frames, instance=instance)
-        if instance in known:
-            fits[instance] = fit_patch(stacks[instance], known[instance].coefficients.numpy(), num_steps=0)
-            continue
+        members = members.select(torch.isin(members.view_index, views[spread_views(cameras[views], most)]))
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
-        unfitted[instance] = stacks[instance], rough
+        unfitted[instance] = _stack(members, cameras, frames, instance=instance), rough
     answers = map_in_order(partial(_fit_first, is_rough=is_rough), unfitted.values(), workers)
     shown = progress_bar(answers, "surfaces", len(unfitted), unit="instance")
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
@@ -108,17 +103,21 @@ def fit_surfaces(
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
             fits[instance] = fit
-    fits = {instance: fits[instance] for instance in stacks if instance in fits}
-    unknown = [instance for instance in fits if instance not in known]
+    first = dict(fits)
     if not is_rough:
-        offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
-        errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-        points = {instance: patch_grid(*FIT.grid).points(fit.coefficients) for instance, fit in fits.items()}
-        asked = [(instance, stacks[instance], fits[instance]) for instance in unknown]
+        there: dict[int, PatchFit | LeafSurface] = {**fits, **{n: each for n, each in known.items() if each.exists}}
+        ordered = dict(sorted(there.items()))
+        offsets = [np.asarray(each.offsets_px) for each in ordered.values()]
+        finite = [each[np.isfinite(each)] for each in offsets]
+        errors = learn_mask_errors([each for each in finite if len(each) > 1])
+        points = {n: patch_grid(*FIT.grid).points(np.asarray(each.coefficients)) for n, each in ordered.items()}
+        asked = [(instance, stacks[instance], fit) for instance, fit in first.items()]
         refitted = map_in_order(partial(_fit_again, points, errors), asked, workers)
-        for instance, (masks, better) in zip(unknown, refitted, strict=True):
+        for instance, (masks, better) in zip(first, refitted, strict=True):
             stacks[instance], fits[instance] = masks, better
-    surfaces |= {instance: _surface(stacks[instance], fits[instance], is_judged=not is_rough) for instance in unknown}
+    for instance, fit in fits.items():
+        offsets_px = first[instance].offsets_px
+        surfaces[instance] = _surface(stacks[instance], fit, offsets=offsets_px, is_judged=not is_rough)
     oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
     return {**oriented, **known}
 
@@ -303,12 +302,13 @@ def _fit_again(
     return masks, replace(fit_patch(masks, fit.coefficients, num_steps=FIT.num_steps, errors=errors), spread=fit.spread)
 
 
-def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface:
+def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
+    """What a fit found; `offsets` (S,) are those of the first one."""
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)
-    offsets = np.nan_to_num(fit.offsets_px)
-    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, is_blurred=False) >= 0.5
+    grown = np.nan_to_num(fit.offsets_px)
+    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=grown, is_blurred=False) >= 0.5
     iou, inside = crop_ious(masks, drawn), masks.inside.sum((1, 2))
     lacking = float(((masks.inside & ~drawn).sum((1, 2)) / np.median(inside)).max())
     surface = LeafSurface(
@@ -319,6 +319,7 @@ def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface
         iou=torch.from_numpy(iou),
         is_oriented=False,
         quality=Quality(),
+        offsets_px=torch.from_numpy(offsets),
     )
     # Where other fits are as good, all deviations are larger by as much as that of the area is.
     wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,8 @@ class LeafSurface:
             drawn as much too large or small as the mask seems to be; NaN where the fit did not get that far.
         is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
         quality: good, or the reasons to doubt it.
+        offsets_px: (S,) float64, how much too large its masks were for its first fit, in pixels of that: all masks of a
+            scene tell how they err. (0,) where that is not known: of a surface that was read from a file.
     """
 
     coefficients: Tensor
@@ -67,6 +69,7 @@ class LeafSurface:
     iou: Tensor
     is_oriented: bool
     quality: Quality
+    offsets_px: Tensor = field(default_factory=partial(torch.zeros, 0, dtype=torch.float64))
     _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
