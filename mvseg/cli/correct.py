@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
     from mvseg.server.open_result import OpenResult, check_writable, open_alone
     from mvseg.server.open_tracks import OpenTracks
     from mvseg.system.running import running
-    from mvseg.system.worker_pool import default_workers
+    from mvseg.system.worker_pool import default_workers, load_ahead
     from mvseg.tracking.recorded import is_tracks
 
     has_tracks = is_tracks(args.result)
@@ -45,7 +45,7 @@ def run(args: Namespace) -> int:
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     with open_alone(folder), ExitStack() as stack:
-        stack.enter_context(running(num_workers=1 if has_tracks else num_workers, keep=True))
+        now = stack.enter_context(running(num_workers=1 if has_tracks else num_workers, keep=True))
         opened: OpenResult | OpenTracks = OpenTracks(folder, args.plant) if has_tracks else OpenResult(folder)
         if opened.notice:
             print(f"mvseg: {opened.notice}", file=sys.stderr)
@@ -54,6 +54,7 @@ def run(args: Namespace) -> int:
         computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:
             computing.start()
+            load_ahead(now.workers, num_workers, "mvseg.reconstruction.surface.fit_surfaces")
             print(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.", flush=True)
             if not args.no_browser:
                 webbrowser.open(server.address)

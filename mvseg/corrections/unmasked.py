@@ -50,17 +50,20 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
     return [
         part
         for view, (photo, rows, step) in enumerate(views)
-        for part in _parts(has_leaf_color(photo, colors) & (rows < 0), rows, view=view, step=step)
-        if part.area >= least_area
+        for part in _parts(
+            has_leaf_color(photo, colors) & (rows < 0), rows, view=view, step=step, least_area=least_area
+        )
     ]
 
 
-def _parts(is_free: Bools, rows: Ints, *, view: int, step: int) -> Iterator[Unmasked]:
+def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: float) -> Iterator[Unmasked]:
     opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((DOUBTS.opening,) * 2, np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     (height, width), beside = rows.shape, DOUBTS.beside
     for label in range(1, count):
         left, top, wide, high, area = stats[label].tolist()
+        if area * step**2 < least_area:
+            continue
         is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
         if not is_inside or area > DOUBTS.most_share * rows.size:
             continue

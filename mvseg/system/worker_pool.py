@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
@@ -71,6 +72,13 @@ def default_workers() -> int:
     """One for each core that this process may use, but at most four: each takes half a gigabyte of memory."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(4, cores)
+
+
+def load_ahead(workers: ProcessPoolExecutor | None, num_workers: int, module: str) -> None:
+    """Let all processes of a pool start and load a module, which takes seconds, before anybody waits for them."""
+    for _ in range(0 if workers is None else num_workers):
+        with one_thread():
+            workers.submit(import_module, module)
 
 
 def map_in_order(

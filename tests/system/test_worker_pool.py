@@ -20,7 +20,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.numbers import SEARCH
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.system.running import running
-from mvseg.system.worker_pool import default_workers, map_in_order, run_all, start_workers
+from mvseg.system.worker_pool import default_workers, load_ahead, map_in_order, run_all, start_workers
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
 
@@ -56,7 +56,10 @@ def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> No
     cameras = ring_cameras(4)
     regions, ids = as_regions(blade_masks(EllipticBlade(), cameras))
     here = fit_surfaces(regions, ids, cameras)[1]
-    with running(num_workers=2):
+    with running(num_workers=2) as now:
+        assert now.workers is not None
+        load_ahead(now.workers, 1, fit_surfaces.__module__)
+        assert len(now.workers._processes) == 1  # it loads while nobody waits
         there = fit_surfaces(regions, ids, cameras)[1]
     assert here.exists
     assert torch.equal(here.coefficients, there.coefficients)
