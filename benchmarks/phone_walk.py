@@ -1,8 +1,9 @@
 """From photos to leaves, as docs/guide.md begins: `python -m benchmarks.phone_walk --out DIR`
 
-The shipped plant is photographed on a walk once round it: 45 photos of 1632 x 1224 pixels, the camera going up and
-down. Then `mvseg pose` and `mvseg infer` run on the photos alone. Printed: CPU seconds of each, and how many photos and
-leaves there are.
+The shipped plant is photographed on a walk once round it: 20 photos of 1632 x 1224 pixels, the camera going up and
+down. Then `mvseg pose` and `mvseg infer` run on the photos alone; `mvseg check` and `mvseg match` on these cameras with
+the masks that were found. Printed: CPU seconds of each, and how many photos and leaves there are. For the time of an
+edit of the result, see `speed/edits.py`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
 
 ROOT = Path(__file__).parents[1]
-NUM_PHOTOS, SIZE = 45, (1632, 1224)
+NUM_PHOTOS, SIZE = 20, (1632, 1224)
 
 
 def write_walk(folder: Path) -> None:
@@ -40,7 +41,8 @@ def run(*words: str) -> float:
     """Run a verb on one thread; returns its CPU seconds."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "-m", "mvseg.cli", *words, "--quiet"], env=environment, check=True)
+    command = [sys.executable, "-m", "mvseg.cli", *words, "--quiet"]
+    subprocess.run(command, env=environment, check=True, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
@@ -52,13 +54,16 @@ def main() -> None:
     if not (out / "walk").exists():
         out.mkdir(parents=True, exist_ok=True)
         write_walk(out / "walk")
-    posing = run("pose", str(out / "walk" / "images"), "--out", str(out / "plant"))
-    inferring = run("infer", str(out / "plant"), "--num_workers", "1", "--out", str(out / "result"))
-    posed = json.loads((out / "plant" / "pose.json").read_text())
-    said = json.loads((out / "result" / "run.json").read_text())
-    registered, leaves = len(posed["registered"]), said["counts"]["instances"]
-    print(f"pose {posing:.0f} CPU s: {registered} of {NUM_PHOTOS} photos registered")
-    print(f"infer {inferring:.0f} CPU s: {leaves} leaves found, {NUM_LEAVES} are there")
+    plant, result = str(out / "plant"), str(out / "result")
+    posing = run("pose", str(out / "walk" / "images"), "--out", plant)
+    registered = len(json.loads((out / "plant" / "pose.json").read_text())["registered"])
+    print(f"pose {posing:.0f} CPU s: {registered} of {NUM_PHOTOS} photos registered", flush=True)
+    inferring = run("infer", plant, "--num_workers", "1", "--out", result)
+    leaves = json.loads((out / "result" / "run.json").read_text())["counts"]["instances"]
+    print(f"infer {inferring:.0f} CPU s: {leaves} leaves found, {NUM_LEAVES} are there", flush=True)
+    masks = "--masks", f"{result}/labels"
+    print(f"check {run('check', plant, *masks):.0f} CPU s", flush=True)
+    print(f"match {run('match', plant, *masks, '--out', str(out / 'matched')):.0f} CPU s")
 
 
 if __name__ == "__main__":

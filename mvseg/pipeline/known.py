@@ -85,6 +85,10 @@ class Known:
         """V views of the proposals, see `draw_views`."""
         return draw_views(self.proposals.regions, (), self.scene.cameras.to("cpu"))
 
+    def draw_ahead(self) -> None:
+        """Find what all edits of chosen masks begin with, before anybody waits for the first one."""
+        _ = self.shown, [each.is_shared for each in self.drawn]
+
     @cached_property
     def leaf_colors(self) -> NDArray[np.bool_]:
         """The colours of leaves, see `colors_of_leaves`."""

@@ -144,6 +144,8 @@ class OpenResult:
         news = describe_update(shown, pictures)
         self._shown = shown, pictures
         yield Update(news, outcomes, vanished + messages)
+        if self.opened.is_chosen:
+            self._now_known[0].draw_ahead()
 
     @cached_property
     def _shown(self) -> tuple[Result, list[Picture]]:
@@ -181,7 +183,7 @@ class OpenResult:
             Cancelled: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        known, messages = self._known if self.learned is None else self.learned
+        known, messages = self._now_known
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(known, corrections)
             result = shape_leaves(edited)
@@ -253,6 +255,10 @@ class OpenResult:
         found = refine_outline(self.photos(view), straight)
         placed = found if lens is None else photo_from_pinhole(lens, K, found)
         return {"polygon": np.round(placed, 2).tolist()}
+
+    @property
+    def _now_known(self) -> tuple[Known, list[str]]:
+        return self._known if self.learned is None else self.learned
 
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:

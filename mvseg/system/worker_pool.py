@@ -76,9 +76,10 @@ def default_workers() -> int:
 
 def load_ahead(workers: ProcessPoolExecutor | None, num_workers: int, module: str) -> None:
     """Let all processes of a pool start and load a module, which takes seconds, before anybody waits for them."""
-    for _ in range(0 if workers is None else num_workers):
+    if workers is not None:
         with one_thread():
-            workers.submit(import_module, module)
+            for _ in range(num_workers):
+                workers.submit(import_module, module)
 
 
 def map_in_order(

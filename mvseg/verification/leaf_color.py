@@ -84,11 +84,14 @@ def thin_views(
         photo = photos(view)
         height, width = photo.shape[:2]
         step = -(-max(height, width) // most_px)
-        rows = np.full((height, width), -1)
+        thin = np.ascontiguousarray(photo[::step, ::step])
+        rows = np.full(thin.shape[:2], -1)
         for row in (masks.view_index == view).nonzero()[:, 0].tolist():
             crop = masks.regions.placed(row)
-            crop.cut(rows)[crop.pixels.numpy()] = row
-        views.append((np.ascontiguousarray(photo[::step, ::step]), rows[::step, ::step], step))
+            left, top = (-(-start // step) for start in crop.box[:2])
+            pixels = crop.pixels.numpy()[top * step - crop.box[1] :: step, left * step - crop.box[0] :: step]
+            rows[top : top + pixels.shape[0], left : left + pixels.shape[1]][pixels] = row
+        views.append((thin, rows, step))
         counts += count_colors(views[-1][0], is_leaf[views[-1][1]])
     return views, leaf_colors(counts)
 
