@@ -17,7 +17,8 @@ from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
-from mvseg.reconstruction.surface.kept_surfaces import fit_kept, name_each
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.scene import Cameras
 from mvseg.verification.join_halves import are_one_leaf
 
@@ -48,7 +49,8 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
         if len({int(masks.view_index[row]) for row, _ in halves}) < EDITS.least_halves:
             continue
         own = torch.where(ids == one, 1, torch.where(ids == other, 2, -1))
-        if are_one_leaf(masks.regions, own, fit_kept(masks.regions, own, cameras), cameras=cameras):
+        surfaces = fit_surfaces(masks.regions, own, cameras)  # not kept: what hides a leaf is not here
+        if are_one_leaf(masks.regions, own, surfaces, cameras=cameras):
             more = Links(torch.cat((links.must, torch.tensor(halves))), links.cannot)
             with suppress(InputError):
                 more.components(len(masks))
