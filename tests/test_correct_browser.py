@@ -93,7 +93,8 @@ def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, f
     tab.page.get_by_label("delete edit 1").click()
     tab.wait_for("What you see follows from all edits.")
     assert ops(folder) == ["confirm"]
-    tab.page.locator("#mode-look").click()
+    with tab.page.expect_navigation():  # what edits changed is shown by a page loaded anew
+        tab.page.locator("#mode-look").click()
     tab.page.wait_for_function("() => !document.querySelector('main').hidden && data.numMasks === 12")
     tab.page.close()
 
