@@ -40,7 +40,8 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
-from mvseg.verification.choose import choose, gather_candidates
+from mvseg.verification.choice import choose
+from mvseg.verification.choose import gather_candidates
 from mvseg.verification.evidence import Drawn, draw_views, see
 from mvseg.verification.leaf_scores import FITTED, Candidates, LeafScores, matched_features, shows_features
 from mvseg.verification.snap_edges import snap_masks

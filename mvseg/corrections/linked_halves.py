@@ -12,13 +12,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mvseg.corrections.as_seen import seen_ids
 from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.scene import Cameras
 from mvseg.verification.join_halves import are_one_leaf
 
@@ -41,8 +41,7 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
     masks, links = corrected.masks, corrected.links
     if not len(links.must):
         return corrected
-    known = dict(zip(name_each(before.regions), before.instance_ids.tolist(), strict=True))
-    ids = torch.tensor([known.get(name, -1) for name in name_each(masks.regions)], dtype=torch.int64)
+    ids = seen_ids(masks, before)
     is_linked = masks.is_linked
     for one, other in sorted({(min(pair), max(pair)) for pair in ids[links.must].tolist()}):
         halves = _in_one_photo(masks, ids == one, ids == other) if 0 < one < other else []

@@ -5,14 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from mvseg.corrections.apply import apply
-from mvseg.corrections.corrected import apply_everywhere
+from mvseg.corrections.as_seen import leave_joined, leaves_as_seen, seen_ids
+from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.matching.match import describe_disagreement, match_masks
+from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
@@ -32,14 +35,14 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
         return known
     opened, cameras, config = known.opened, known.scene.cameras, known.opened.config
     with timed("correct"):
-        shown = known.shown
+        shown, before = known.shown, known.masks.to("cpu")
         corrected = apply(corrections, shown, known.scene)
+        corrected = link_halves(corrected, before, cameras.to("cpu"))
+        seen = seen_ids(corrected.masks, before) if opened.is_chosen else torch.full_like(corrected.last_edits, -1)
+        seen = seen.where(torch.isin(seen, leaves_as_seen(corrected, seen, before)), -1)
     with timed("match"):
-        corrected = link_halves(corrected, known.masks.to("cpu"), cameras.to("cpu"))
-        is_known = 2 * int(corrected.masks.is_corrected.sum()) <= len(known.masks)  # else his masks tell it better
-        residual_px = known.matching.report.residual_px if is_known else None
-        matching = match_masks(corrected.masks, cameras, config.match, links=corrected.links, residual_px=residual_px)
-    masks, corrected = apply_everywhere(corrected, matching.masks.to("cpu"))
+        matching, seen = _match_anew(known, corrected, seen)
+    masks, corrected = apply_everywhere(corrected, matching.masks)
     if len(shown) and not len(masks):
         warn(NOTHING_LEFT)
     edited = replace(
@@ -68,10 +71,32 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
             cameras=cameras,
             more=known.matched,
             gone=_taken_away(shown, masks),
+            seen=seen_ids(masks, replace(corrected.masks, instance_ids=seen)),
             drawn=known.drawn,
             min_probability=config.detect.min_probability,
         )
     return edited.with_leaves(leaves)
+
+
+def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Matching, Tensor]:
+    """The masks matched anew, but for those of leaves that stay as they were `seen` (D,): these keep their ids. Where
+    the views choose, and a person speaks of such leaves only, nothing else is needed. And the leaves that stay."""
+    masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
+    is_held = masks.is_corrected | masks.is_linked
+    if known.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
+        return known.matching.with_masks(replace(masks, instance_ids=seen).close_gaps()), seen
+    is_known = 2 * int(masks.is_corrected.sum()) <= len(known.masks)  # else his masks tell it better
+    matching = match_masks(
+        masks,
+        known.scene.cameras,
+        known.opened.config.match,
+        links=corrected.links,
+        residual_px=known.matching.report.residual_px if is_known else None,
+    )
+    matched = matching.masks.to("cpu")
+    seen = leave_joined(seen, matched.instance_ids, is_held)
+    ids = torch.where(seen > 0, seen + matched.num_instances, matched.instance_ids)
+    return matching.with_masks(replace(matched, instance_ids=ids).close_gaps()), seen
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:

@@ -30,7 +30,6 @@ from mvseg.verification.shown_leaves import ask, settle
 Surfaces = Mapping[int, LeafSurface]
 
 
-
 def check_ids(
     masks: Masks,
     surfaces: Surfaces,

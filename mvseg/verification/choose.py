@@ -14,24 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, see
-from mvseg.verification.leaf_scores import (
-    FITTED,
-    Candidates,
-    LeafScores,
-    best_masks,
-    leaf_chances,
-    leaf_features,
-    log_odds,
-    show_chances,
-)
+from mvseg.verification.choice import Chosen, Said, choose
+from mvseg.verification.evidence import Bools, Drawn, draw_views
+from mvseg.verification.leaf_scores import Candidates
 from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
 
@@ -70,6 +61,7 @@ def choose_leaves(
     cameras: Cameras,
     more: Sequence[Masks] = (),
     gone: Masks | None = None,
+    seen: Tensor | None = None,
     drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
 ) -> Leaves:
@@ -77,7 +69,8 @@ def choose_leaves(
 
     Masks that a person corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
     that no detector found. What else lies there goes, and what the person took away does not come back. All other
-    candidates are those without him: what he says of one leaf changes no other, unless they compete for masks.
+    candidates are those without him: what he says of one leaf changes no other, unless they compete for masks. Where
+    all that he says of a leaf holds already, its candidate is one of these.
 
     Args:
         matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
@@ -86,6 +79,8 @@ def choose_leaves(
         more: masks of other matchings, of more of the proposals, with such labels, too.
         gone: masks that a person took away; None: nobody edited the masks. Otherwise only the instances of a person's
             masks are candidates here, and `more` has the others.
+        seen: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1 elsewhere.
+            None: for none.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
@@ -97,23 +92,41 @@ def choose_leaves(
     proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
     is_held = matched.is_corrected | matched.is_linked
     is_held |= (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
-    left = _without(proposals, gone)
-    is_added = is_held | ~_are_proposals(matched, proposals)  # what a person made, and what was cut since
+    seen = torch.full_like(matched.instance_ids, -1) if seen is None else seen.cpu()
+    ids = matched.instance_ids
+    is_apart = (
+        matched.is_linked & ~matched.is_corrected & (ids < 1)
+    )  # all that is said of it: which leaf it does not show
+    is_added = ~_are_proposals(matched, proposals) | (
+        is_held & (seen < 1)
+    )  # what a person made, and what was cut since
     added = matched.select(is_added)
-    table = Masks.concatenate((proposals, added.with_merged(())))
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
-    held = np.zeros(len(table), bool)
-    held[row_of[is_held].numpy()] = True
-    has_shapes, ids = _is_seen_around(matched, cameras), matched.instance_ids
+    table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
+    leaf = seen.where(~is_added, -1)
+    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_held & ~is_apart, leaf=leaf)
+    has_shapes = _is_seen_around(matched, cameras)
     if gone is not None:
-        matched = replace(matched, instance_ids=ids.where(torch.isin(ids, ids[is_held]), -1))
-    found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
+        ids = ids.where(torch.isin(ids, ids[is_held & (seen < 1)]) & (seen < 1), -1)
+        gone = Masks.concatenate((gone.to("cpu").with_merged(()), matched.select(is_apart).with_merged(())))
+    found = [(replace(matched, instance_ids=ids), row_of)]
+    found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
-    seen = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
-    usable = np.concatenate((left, np.ones(len(added), bool)))
-    chosen = choose(candidates, table, drawn=seen, usable=usable, min_probability=min_probability)
-    return _take(chosen, candidates, table, is_held=held)
+    views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
+    usable = np.concatenate((_without(proposals, gone), np.ones(len(added), bool)))
+    for each in views:
+        is_sure = said.is_sure[each.rows]
+        usable[each.rows] &= is_sure | ~each.is_shared[:, is_sure].any(1)
+    chosen = choose(candidates, table, drawn=views, usable=usable, said=said, min_probability=min_probability)
+    return _take(chosen, candidates, table, is_held=said.is_sure)
+
+
+def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
+    """The table with what a person said of the matched masks that are in it."""
+    origin, is_linked = table.origin.clone(), table.is_linked.clone()
+    origin[row_of], is_linked[row_of] = matched.origin, matched.is_linked
+    return replace(table, origin=origin, is_linked=is_linked)
 
 
 def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
@@ -229,160 +242,6 @@ def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
         if common > CHOICE.same * either:
             return True
     return False
-
-
-# --- the choice
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One candidate as the choice met it.
-
-    Attributes:
-        candidate: its index.
-        chance: P, when the leaves before it had taken their masks.
-        features: (6,) that P follows from.
-        rows: of the masks that it may take.
-    """
-
-    candidate: int
-    chance: float
-    features: Floats
-    rows: Ints
-
-
-@dataclass(frozen=True, eq=False)
-class Chosen:
-    """L leaves, the likeliest first.
-
-    Attributes:
-        candidates: (L,) int64, their indices.
-        chances: (L,) P.
-        leaf: (D,) int64, the leaf that each mask shows, from 0 on; -1 for none.
-        q: (D,) how likely it does; 0 for none.
-        steps: of all candidates, the likeliest first.
-    """
-
-    candidates: Ints
-    chances: Floats
-    leaf: Ints
-    q: Floats
-    steps: tuple[Step, ...]
-
-
-def choose(
-    candidates: Candidates,
-    table: Masks,
-    *,
-    drawn: Sequence[Drawn],
-    usable: Bools | None = None,
-    min_probability: float | None = None,
-    fitted: LeafScores = FITTED,
-) -> Chosen:
-    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only)."""
-    scores = table.detection_scores.double().numpy()
-    hides, taken, q = np.zeros(len(candidates), bool), [], np.zeros((len(table), len(candidates)))
-    steps: list[Step] = []
-    for _ in range(CHOICE.rounds):
-        evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
-        q[~same_class(candidates, table)] = 0
-        if usable is not None:
-            q[~usable] = 0
-        steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
-        least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
-        taken = [
-            each for each in steps
-            if candidates.is_certain[each.candidate] or (each.chance >= least and len(each.rows) >= CHOICE.least_views)
-        ]  # fmt: skip
-        hides = np.zeros(len(candidates), bool)
-        hides[[each.candidate for each in taken]] = True
-        hides &= candidates.is_credible
-        if not hides.any():
-            break
-    chosen = np.array([each.candidate for each in taken], np.int64)
-    leaf, shown = assign_masks(q[:, chosen], drawn)
-    certain = candidates.certain[:, chosen]
-    leaf = np.where(certain.any(1), certain.argmax(1), leaf) if len(chosen) else leaf
-    shown = np.where(certain.any(1), 1.0, shown)
-    counts = np.bincount(leaf[leaf >= 0], minlength=len(chosen))
-    stays = (counts >= CHOICE.least_views) | candidates.is_certain[chosen]
-    number = np.where(stays, stays.cumsum() - 1, -1)
-    leaf = np.where(leaf >= 0, number[leaf], -1) if len(chosen) else leaf
-    chances = np.array([each.chance for each in taken])
-    return Chosen(chosen[stays], chances[stays] if len(chosen) else chances, leaf, shown * (leaf >= 0), tuple(steps))
-
-
-def same_class(candidates: Candidates, table: Masks) -> Bools:
-    """(D, K) whether a mask has the class of the masks that were matched to a candidate."""
-    classes, is_member = table.classes.numpy(), ~np.isnan(candidates.matched)
-    if not len(candidates):
-        return np.zeros((len(table), 0), bool)
-    first = is_member.argmax(0)
-    return classes[:, None] == classes[first]
-
-
-def rank(
-    candidates: Candidates, q: Floats, *, drawn: Sequence[Drawn], share: Floats, scores: Floats, fitted: LeafScores
-) -> list[Step]:
-    """The candidates, the likeliest leaf first; each takes masks that those after it can no longer have, and with them
-    all that show the same."""
-    view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
-    for number, each in enumerate(drawn):
-        view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
-    left, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
-    sure, rows_of_views = log_odds(scores), [each.rows for each in drawn]
-    while left.any():
-        best, row = best_masks(free, rows_of_views)
-        features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
-        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
-        first = int(chances.argmax())
-        own = best[:, first]
-        rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
-        rows = np.union1d(rows, np.flatnonzero(candidates.certain[:, first]))
-        steps.append(Step(first, float(chances[first]), features[first], rows))
-        left[first] = False
-        for taken in rows.tolist():
-            there = drawn[view[taken]]
-            free[there.rows[there.is_shared[place[taken]]]] = 0
-    return steps
-
-
-def least_chance(chances: Floats) -> float:
-    """From which chance on to take things, for the largest expected F1 of what is taken against what is right: with n
-    taken, 2 sum(chances taken) / (n + sum(all chances)). Nothing is tuned here, and it is never above one half.
-
-    Args:
-        chances: (N,) in [0, 1].
-    """
-    order = np.sort(chances)[::-1]
-    if not len(order) or order[0] <= 0:
-        return 1.0
-    gain = np.round(order.cumsum() / (np.arange(1, len(order) + 1) + order.sum()), CHOICE.digits)
-    return float(order[gain.argmax()])
-
-
-def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
-    """(D,) the leaf that each mask shows, -1 = none, and its chance.
-
-    In every view the assignment of masks to the L leaves of `q` (D, L) with the largest sum of chances, each used once.
-    Of two masks in it that show the same, the likelier one stays, and the other leaf takes its next best.
-    """
-    leaf, shown = np.full(len(q), -1), np.zeros(len(q))
-    for each in drawn if q.shape[1] else ():
-        free = np.where(q[each.rows] >= CHOICE.least_shown, q[each.rows], 0.0)
-        while True:
-            masks, leaves = linear_sum_assignment(free, maximize=True)
-            chances = free[masks, leaves]
-            order = np.argsort(-chances, kind="stable")
-            order = order[chances[order] > 0]
-            masks, leaves = masks[order], leaves[order]
-            conflicts = np.flatnonzero(np.triu(each.is_shared[np.ix_(masks, masks)], 1).any(0))
-            if not len(conflicts):
-                leaf[each.rows[masks]], shown[each.rows[masks]] = leaves, chances[order]
-                break
-            free[masks[conflicts[0]]] = 0
-    return leaf, shown
 
 
 def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:

@@ -23,7 +23,6 @@ from mvseg.verification.numbers import PARTS
 Surfaces = Mapping[int, LeafSurface]
 
 
-
 def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
     """Instances that are parts of one leaf get one id.
 

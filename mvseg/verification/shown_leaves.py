@@ -19,7 +19,8 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import gather_candidates, same_class
+from mvseg.verification.choice import same_class
+from mvseg.verification.choose import gather_candidates
 from mvseg.verification.evidence import Bools, Drawn, Evidence, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import Candidates, log_odds
 from mvseg.verification.match_again import match_again

@@ -14,7 +14,7 @@ import torch
 from blade_scene import as_regions
 from found_masks import FoundMasks, open_photos, see_masks
 from mvseg.corrections.corrected import APPLIED
-from mvseg.corrections.file import Corrections, Edit, Reject
+from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Reject
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
@@ -119,6 +119,25 @@ def test_an_answer_that_changes_nothing_changes_nothing() -> None:
     assert before.instances.probabilities == after.instances.probabilities
     assert torch.equal(before.masks.instance_ids, after.masks.instance_ids)
     assert torch.equal(before.masks.regions.crops, after.masks.regions.crops)
+
+
+def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The masks that they name are certain now; all else is as it was, also the numbers of the leaves."""
+    before = run()
+    monkeypatch.setattr("mvseg.pipeline.apply_edits.match_masks", lambda *_, **__: pytest.fail("matched anew"))
+    same = Link(op="same", at=(("v1", *at(WEAK, 1)), ("v3", *at(WEAK, 3))))
+    said = Confirm(view="v0", at=at(2, 0)), same
+    after = run(*said)
+    assert torch.equal(before.masks.regions.labels, after.masks.regions.labels)
+    assert torch.equal(before.masks.instance_ids, after.masks.instance_ids)
+    named = after.masks.is_linked | (after.masks.origin == Origin.CONFIRMED)
+    assert int(named.sum()) == 3
+    assert after.masks.match_scores[named].tolist() == [1, 1, 1]
+    certain = {leaf for leaf, chance in after.instances.probabilities.items() if chance == 1}
+    assert certain == set(after.masks.instance_ids[named].tolist())
+    less = run(*said, Reject(view="v4", at=at(1, 4)))
+    for view, (one, other) in enumerate(zip(as_painted(before), as_painted(less), strict=True)):
+        np.testing.assert_array_equal(np.where((one == 1) & (view == 4), 0, one), other)
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:

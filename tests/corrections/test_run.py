@@ -96,8 +96,7 @@ def test_edits_do_not_estimate_the_reprojection_error_again(plant: Path, monkeyp
     known = match_given(open_scene(plant, plant / "masks", IDS_ONLY))
     outlines = {(view, ball): np.array(middle(plant, view, ball)) + SQUARE for view in range(4) for ball in (1, 2)}
     drawn = [
-        {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()}
-        for (view, _), polygon in outlines.items()
+        {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()} for (view, _), polygon in outlines.items()
     ]
     apply_edits(known, corrections({"op": "reject"} | at(plant, 0, 1)))
     apply_edits(known, corrections(*drawn))

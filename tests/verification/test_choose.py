@@ -16,7 +16,8 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choose import Leaves, add_beside, assign_masks, choose_leaves, gather_candidates, least_chance
+from mvseg.verification.choice import assign_masks, least_chance
+from mvseg.verification.choose import Leaves, add_beside, choose_leaves, gather_candidates
 from mvseg.verification.evidence import draw_views
 from mvseg.verification.leaf_scores import Candidates, leaf_features
 from mvseg.verification.numbers import ROUGH
@@ -160,13 +161,67 @@ def test_masks_are_added_where_the_others_show_nothing() -> None:
     assert add_beside(two, two, CAMERAS).regions.labels.tolist() == two.regions.labels.tolist()
 
 
-def test_a_drawn_mask_that_matches_nothing_stays_without_an_id() -> None:
-    ids = torch.where(torch.arange(len(IDS)) == 4, -1, IDS)
+def test_a_drawn_mask_that_was_matched_to_nothing_shows_the_leaf_that_the_views_say_or_none() -> None:
+    square = np.zeros((SIZE, SIZE), np.int64)
+    square[2:14, 2:14] = 1
+    corner, _ = as_regions([np.zeros_like(square)] * 2 + [square] + [np.zeros_like(square)] * 3)
+    row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
+    matched = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, -1, IDS))
+    matched.origin[row] = Origin.CORRECTED
+    drawn = replace(Masks.of(corner, origin=Origin.CORRECTED), regions=replace(corner, labels=torch.tensor([-1])))
+    leaves = choose(Masks.concatenate((matched, drawn)))
+    of_person = leaves.masks.origin == Origin.CORRECTED
+    assert sorted(leaves.masks.regions.areas[of_person].tolist()) == sorted([144, int(REGIONS.areas[row])])
+    assert leaves.masks.instance_ids[of_person & (leaves.masks.regions.labels == -1)].tolist() == [-1]
+    assert same_partition(leaves)
+
+
+def said_of(row: int, ids: torch.Tensor = IDS) -> Masks:
+    """All proposals matched, and a person spoke of one."""
     matched = matched_of(PROPOSALS, ids)
-    origin = matched.origin.clone()
-    origin[4] = Origin.CORRECTED
-    leaves = choose(replace(matched, origin=origin))
-    assert leaves.masks.instance_ids[leaves.masks.origin == Origin.CORRECTED].tolist() == [-1]
+    return replace(matched, is_linked=torch.arange(len(IDS)) == row)
+
+
+def test_what_is_said_of_a_leaf_that_stays_as_it_was_seen_changes_no_other_mask() -> None:
+    """Bit for bit, but that the mask is certain now, and the leaf."""
+    plain = choose(matched_of(PROPOSALS, IDS))
+    moved = said_of(3, IDS % 3 + 1)
+    same = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), seen=IDS)
+    said = same.masks.regions.labels == 3
+    (leaf,) = same.masks.instance_ids[said].tolist()
+    assert torch.equal(plain.masks.regions.labels, same.masks.regions.labels)
+    assert torch.equal(plain.masks.instance_ids, same.masks.instance_ids)
+    assert torch.equal(plain.masks.match_scores.where(~said, 1.0), same.masks.match_scores)
+    assert {**plain.probabilities, leaf: 1.0} == same.probabilities
+    assert same.masks.is_linked.tolist() == said.tolist()
+
+
+def test_a_mask_that_a_person_keeps_apart_from_a_leaf_does_not_return_to_it() -> None:
+    """Nor does a copy of it; where no other leaf takes it, it goes."""
+    row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
+    other = int(((REGIONS.view_index == 3) & (IDS == 2)).nonzero()[0, 0])
+    proposals = Masks.concatenate((PROPOSALS, PROPOSALS.select(torch.tensor([row]))))
+    first = matched_of(proposals, torch.cat((IDS, torch.tensor([-1]))))
+    edited = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, -1, IDS))
+    edited = replace(edited, is_linked=torch.isin(torch.arange(len(IDS)), torch.tensor([row, other])))
+    leaves = choose(edited, proposals, gone=proposals.select(torch.zeros(len(proposals)) > 0), more=(first,))
+    assert set(leaves.masks.regions.labels.tolist()) == set(range(len(IDS))) - {row}
+    without = [np.where((labels == 2) & (view == 2), 0, labels) for view, labels in enumerate(TRUE)]
+    assert same_partition(leaves, without)
+
+
+def test_what_lies_under_a_mask_of_a_person_goes() -> None:
+    """He draws half of a leaf, which is matched to nothing."""
+    row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
+    half = [
+        np.where((labels == 2) & (np.arange(SIZE) < REGIONS.boxes[row, 0::2].float().mean().item()), 1, 0)
+        for labels in TRUE
+    ]
+    drawn = Masks.of(as_regions([each * (view == 2) for view, each in enumerate(half)])[0], origin=Origin.CORRECTED)
+    matched = matched_of(PROPOSALS, IDS).select(torch.arange(len(IDS)) != row)
+    leaves = choose(Masks.concatenate((matched, drawn)))
+    here = leaves.masks.select(leaves.masks.view_index == 2).regions
+    assert int(here.areas.sum()) == int((here.label_map(2, torch.ones(len(here)), (SIZE, SIZE)) > 0).sum())
 
 
 def test_the_order_of_masks_does_not_matter() -> None:

@@ -1,0 +1,59 @@
+"""What a person says of a leaf often holds already: such a leaf stays as he saw it. Not in the paper."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mvseg.corrections.corrected import Corrected
+from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.surface.kept_surfaces import name_each
+
+
+def seen_ids(masks: Masks, before: Masks) -> Tensor:
+    """(D,) int64, the ids that a person saw: those of the same masks before edits; -1 for those that were not there."""
+    known = dict(zip(name_each(before.regions), before.instance_ids.tolist(), strict=True))
+    return torch.tensor([known.get(name, -1) for name in name_each(masks.regions)], dtype=torch.int64)
+
+
+def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
+    """The leaves that edits leave as they were, or confirm: none of their masks is gone, changed, kept apart from
+    another one, or linked to one of another leaf, and the leaf is not rejected.
+
+    Args:
+        corrected: D masks and their links.
+        ids: (D,) int64, their `seen_ids`.
+        before: the masks before the edits, on the CPU, with the ids that the person saw.
+
+    Returns:
+        (L,) int64, their ids in `before`.
+    """
+    must, cannot = ids[corrected.links.must.reshape(-1, 2)], ids[corrected.links.cannot.reshape(-1, 2)]
+    left, all_of = (
+        torch.bincount(each.clamp(min=0), minlength=before.num_instances + 1) for each in (ids, before.instance_ids)
+    )
+    changed = (
+        must[must[:, 0] != must[:, 1]].flatten(),
+        cannot[cannot[:, 0] == cannot[:, 1]].flatten(),
+        ids[[each.row for each in corrected.everywhere if each.rejects]],
+        (left != all_of).nonzero()[:, 0],
+        before.instance_ids[before.origin != Origin.DETECTED],  # the views did not choose these
+    )
+    leaves = before.instance_ids[before.instance_ids > 0].unique()
+    return leaves[~torch.isin(leaves, torch.cat(changed))]
+
+
+def leave_joined(seen: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
+    """The leaves that stay as they were `seen` (D,), without those that other masks join: at least half of the masks of
+    such a leaf are matched to one that a person speaks of, and that is of no such leaf.
+
+    Args:
+        seen: (D,) int64, their ids; -1 for all other masks.
+        matched_ids: (D,) int64, the ids of the masks matched anew.
+        is_held: (D,) bool, the masks that a person speaks of.
+    """
+    is_other = is_held & (seen < 1) & (matched_ids > 0)
+    is_joined = torch.isin(matched_ids, matched_ids[is_other])
+    num = int(seen.max().clamp(min=0)) + 1 if len(seen) else 1
+    joined, all_of = (torch.bincount(seen[each & (seen > 0)], minlength=num) for each in (is_joined, seen > 0))
+    return seen.where((2 * joined < all_of)[seen.clamp(min=0)] & (seen > 0), -1)

@@ -1,0 +1,225 @@
+"""The likeliest leaf first: each takes its masks, and the others are judged by what is left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from mvseg.masks import Masks
+from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, see
+from mvseg.verification.leaf_scores import (
+    FITTED,
+    Candidates,
+    LeafScores,
+    best_masks,
+    leaf_chances,
+    leaf_features,
+    log_odds,
+    show_chances,
+)
+from mvseg.verification.numbers import CHOICE
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One candidate as the choice met it.
+
+    Attributes:
+        candidate: its index.
+        chance: P, when the leaves before it had taken their masks.
+        features: (6,) that P follows from.
+        rows: of the masks that it may take.
+    """
+
+    candidate: int
+    chance: float
+    features: Floats
+    rows: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """L leaves, the likeliest first.
+
+    Attributes:
+        candidates: (L,) int64, their indices.
+        chances: (L,) P.
+        leaf: (D,) int64, the leaf that each mask shows, from 0 on; -1 for none.
+        q: (D,) how likely it does; 0 for none.
+        steps: of all candidates, the likeliest first.
+    """
+
+    candidates: Ints
+    chances: Floats
+    leaf: Ints
+    q: Floats
+    steps: tuple[Step, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Said:
+    """What a person says of D masks.
+
+    Attributes:
+        is_held: (D,) bool, the masks that he speaks of.
+        is_sure: (D,) bool, those of them that show a leaf, as he says.
+        leaf: (D,) int64, the leaf that each was chosen for, if it stays as he saw it; -1 elsewhere.
+    """
+
+    is_held: Bools
+    is_sure: Bools
+    leaf: Ints
+
+    @staticmethod
+    def nothing(num_masks: int) -> Said:
+        """Of any mask."""
+        return Said(np.zeros(num_masks, bool), np.zeros(num_masks, bool), np.full(num_masks, -1))
+
+    @staticmethod
+    def of(num_masks: int, rows: Ints, *, is_held: Tensor, is_sure: Tensor, leaf: Tensor) -> Said:
+        """Of some rows of a table."""
+        said = Said.nothing(num_masks)
+        said.is_held[rows], said.is_sure[rows], said.leaf[rows] = is_held, is_sure, leaf
+        return said
+
+    @property
+    def is_of_others(self) -> Bools:
+        """(D,) whether he says that a mask shows none of the leaves that he changed."""
+        return self.is_held & (~self.is_sure | (self.leaf > 0))
+
+    def candidates_as_seen(self, q: Floats, is_taken: Bools) -> Ints:
+        """(D,) the candidate that each held mask of a leaf that stays shows, -1 for the other masks: of those that were
+        taken (K,), the one that all masks of the leaf show best by q (D, K); of all, where none of these shows it."""
+        found = np.full(len(q), -1)
+        leaves = np.unique(self.leaf[self.is_held & (self.leaf > 0)])
+        if len(leaves):
+            sums = np.stack([q[self.leaf == each].sum(0) for each in leaves])
+            sums += len(q) * (is_taken & (sums > 0))
+            for row, candidate in zip(*linear_sum_assignment(sums, maximize=True), strict=True):
+                found[self.is_held & (self.leaf == leaves[row])] = candidate
+        return found
+
+
+def choose(
+    candidates: Candidates,
+    table: Masks,
+    *,
+    drawn: Sequence[Drawn],
+    usable: Bools | None = None,
+    said: Said | None = None,
+    min_probability: float | None = None,
+    fitted: LeafScores = FITTED,
+) -> Chosen:
+    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only)."""
+    scores = table.detection_scores.double().numpy()
+    hides, taken, q = np.zeros(len(candidates), bool), [], np.zeros((len(table), len(candidates)))
+    steps: list[Step] = []
+    said = said or Said.nothing(len(table))
+    stays, as_seen = candidates.is_certain, np.full(len(table), -1)
+    for _ in range(CHOICE.rounds):
+        evidence = see(drawn, len(table), hides)
+        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
+        q[~same_class(candidates, table)] = 0
+        if usable is not None:
+            q[~usable] = 0
+        q[np.ix_(said.is_of_others, candidates.is_certain)] = 0
+        steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
+        least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
+        is_taken = candidates.is_certain.copy()
+        for each in steps:
+            is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
+        as_seen = said.candidates_as_seen(q, is_taken)
+        stays = candidates.is_certain | np.isin(np.arange(len(candidates)), as_seen)
+        taken = [each for each in steps if is_taken[each.candidate] or stays[each.candidate]]
+        hides = np.zeros(len(candidates), bool)
+        hides[[each.candidate for each in taken]] = True
+        hides &= candidates.is_credible
+        if not hides.any():
+            break
+    chosen = np.array([each.candidate for each in taken], np.int64)
+    leaf, shown = assign_masks(q[:, chosen], drawn)
+    certain = candidates.certain[:, chosen] | (as_seen[:, None] == chosen)
+    leaf = np.where(certain.any(1), certain.argmax(1), leaf) if len(chosen) else leaf
+    shown = np.where(certain.any(1), 1.0, shown)
+    counts = np.bincount(leaf[leaf >= 0], minlength=len(chosen))
+    kept = (counts >= CHOICE.least_views) | stays[chosen]
+    place = np.where(kept, kept.cumsum() - 1, -1)
+    leaf = np.where(leaf >= 0, place[leaf], -1) if len(chosen) else leaf
+    chances = np.array([1.0 if stays[each.candidate] else each.chance for each in taken])
+    return Chosen(chosen[kept], chances[kept] if len(chosen) else chances, leaf, shown * (leaf >= 0), tuple(steps))
+
+
+def same_class(candidates: Candidates, table: Masks) -> Bools:
+    """(D, K) whether a mask has the class of the masks that were matched to a candidate."""
+    classes, is_member = table.classes.numpy(), ~np.isnan(candidates.matched)
+    if not len(candidates):
+        return np.zeros((len(table), 0), bool)
+    first = is_member.argmax(0)
+    return classes[:, None] == classes[first]
+
+
+def rank(
+    candidates: Candidates, q: Floats, *, drawn: Sequence[Drawn], share: Floats, scores: Floats, fitted: LeafScores
+) -> list[Step]:
+    """The candidates, the likeliest leaf first; each takes masks that those after it can no longer have, and with them
+    all that show the same."""
+    view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
+    for number, each in enumerate(drawn):
+        view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
+    left, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
+    sure, rows_of_views = log_odds(scores), [each.rows for each in drawn]
+    while left.any():
+        best, row = best_masks(free, rows_of_views)
+        features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
+        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
+        first = int(chances.argmax())
+        own = best[:, first]
+        rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
+        rows = np.union1d(rows, np.flatnonzero(candidates.certain[:, first]))
+        steps.append(Step(first, float(chances[first]), features[first], rows))
+        left[first] = False
+        for taken in rows.tolist():
+            there = drawn[view[taken]]
+            free[there.rows[there.is_shared[place[taken]]]] = 0
+    return steps
+
+
+def least_chance(chances: Floats) -> float:
+    """From which chance on to take things, for the largest expected F1 of what is taken against what is right: with n
+    taken, 2 sum(chances taken) / (n + sum(all chances)). Nothing is tuned here, and it is never above one half.
+
+    Args:
+        chances: (N,) in [0, 1].
+    """
+    order = np.sort(chances)[::-1]
+    if not len(order) or order[0] <= 0:
+        return 1.0
+    gain = np.round(order.cumsum() / (np.arange(1, len(order) + 1) + order.sum()), CHOICE.digits)
+    return float(order[gain.argmax()])
+
+
+def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
+    """(D,) the leaf that each mask shows, -1 = none, and its chance.
+
+    In every view the assignment of masks to the L leaves of `q` (D, L) with the largest sum of chances, each used once.
+    Of two masks in it that show the same, the likelier one stays, and the other leaf takes its next best.
+    """
+    leaf, shown = np.full(len(q), -1), np.zeros(len(q))
+    for each in drawn if q.shape[1] else ():
+        free = np.where(q[each.rows] >= CHOICE.least_shown, q[each.rows], 0.0)
+        while True:
+            masks, leaves = linear_sum_assignment(free, maximize=True)
+            chances = free[masks, leaves]
+            order = np.argsort(-chances, kind="stable")
+            order = order[chances[order] > 0]
+            masks, leaves = masks[order], leaves[order]
+            conflicts = np.flatnonzero(np.triu(each.is_shared[np.ix_(masks, masks)], 1).any(0))
+            if not len(conflicts):
+                leaf[each.rows[masks]], shown[each.rows[masks]] = leaves, chances[order]
+                break
+            free[masks[conflicts[0]]] = 0
+    return leaf, shown
