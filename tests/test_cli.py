@@ -28,8 +28,8 @@ from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png, write_label_png
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching

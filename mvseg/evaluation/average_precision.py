@@ -18,7 +18,7 @@ from pycocotools.cocoeval import COCOeval
 from torch import Tensor
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.formats.coco import encode_mask
+from mvseg.formats.run_lengths import encode_mask
 
 MAX_DETECTIONS = 100  # per photo, the best by score: COCO's limit, and that of torchvision's detectors
 

@@ -19,12 +19,13 @@ from torch import Tensor
 
 from mvseg.corrections.file import dump_edits
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.formats.coco import encode_mask, write_coco
+from mvseg.formats.coco import write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.masks import Origin
 from mvseg.results.earlier import RESULT, Output, replace_result
 from mvseg.results.overlay import draw_overlay

@@ -22,11 +22,11 @@ from mvseg.corrections.file import parse_corrections
 from mvseg.crop import Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, faults_of
-from mvseg.formats.coco import Rle, decode_crop, decode_rle
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.label_png import read_label_png, read_labels
 from mvseg.formats.lens import undistort
+from mvseg.formats.run_lengths import Rle, decode_crop, decode_rle
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.poses.refine_poses import RefinedPoses

@@ -12,8 +12,9 @@ import numpy as np
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.coco import encode_mask, write_coco
+from mvseg.formats.coco import write_coco
 from mvseg.formats.label_png import read_label_png
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant

@@ -8,7 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from mvseg.errors import InputError
-from mvseg.formats.coco import CocoAnnotation, encode_mask
+from mvseg.formats.coco import CocoAnnotation
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.results.photo_masks import mask_in_photo
 from mvseg.results.read import load_result
 from mvseg.training.data import Sample, SampleList

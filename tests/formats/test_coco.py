@@ -17,8 +17,9 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import decode_rle, encode_mask, read_coco, write_coco
+from mvseg.formats.coco import read_coco, write_coco
 from mvseg.formats.masks.view_regions import stack_views
+from mvseg.formats.run_lengths import decode_rle, encode_mask
 from mvseg.formats.scene_folder import load_masks
 from mvseg.scene import Cameras, Scene, View
 

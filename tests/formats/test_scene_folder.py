@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.lens import distort, opencv_lens
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import IGNORE_LABEL, Regions
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, draw_labels, edit_rig, rig_content, write_image, write_scene

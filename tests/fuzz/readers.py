@@ -25,10 +25,10 @@ from mvseg.cli.options import build_options
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.weights_file import read_weights
 from mvseg.errors import InputError
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.image_file import is_turned, read_rgb, sensor_bits
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import check_photos, read_photo
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig

@@ -23,9 +23,9 @@ from mvseg.config import RunConfig
 from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import Corrections, Reject
 from mvseg.errors import InputError
-from mvseg.formats.coco import decode_crop, decode_rle, encode_mask
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
+from mvseg.formats.run_lengths import decode_crop, decode_rle, encode_mask
 from mvseg.masks import MergedMask, Origin
 from mvseg.matching.result import MatchReport
 from mvseg.pipeline.run_scene import run_scene

@@ -13,7 +13,7 @@ from pycocotools import mask as coco_mask
 
 from mvseg import regions_from_masks, with_instance_ids
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import encode_mask
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_scene
 

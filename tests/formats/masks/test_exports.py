@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.masks.recognise import recognise_masks
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from scene_folders import HEIGHT, WIDTH, write_image, write_scene
 

@@ -14,9 +14,9 @@ import torch
 from PIL import Image
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.masks.recognise import recognise_masks
+from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions
 from mvseg.scene import Scene

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.formats.coco import encode_mask
 from mvseg.formats.masks.sam import read_sam
+from mvseg.formats.run_lengths import encode_mask
 
 MASKS = np.random.default_rng(3).random((3, 20, 30)) > 0.4
 

@@ -1,0 +1,90 @@
+"""COCO's run lengths: masks as the lengths of runs of pixels down the columns, plain or compressed to a string."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pycocotools import mask as coco_mask
+from pydantic import BaseModel, NonNegativeInt
+
+from mvseg.errors import InputError
+from mvseg.formats.json_file import Items
+
+MOST_CHARACTERS = 8  # of a number: 40 bits are more pixels than any image has
+
+
+class Rle(BaseModel):
+    """A run-length encoded mask as it stands in the file; size is (height, width)."""
+
+    size: tuple[int, int]
+    counts: str | Items[NonNegativeInt]
+
+
+def decode_rle(counts: str | list[int], width: int, height: int) -> np.ndarray:
+    """(height, width) bool from the counts of a COCO RLE, compressed or not: run lengths down the columns, 0 first.
+
+    pycocotools leaves uninitialised memory where the counts are too short; here that is an error.
+
+    Raises:
+        InputError: the counts do not add up to the image.
+    """
+    runs = _read_runs(counts, width, height)
+    return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
+
+
+def decode_crop(counts: str | list[int], width: int, height: int) -> tuple[tuple[int, int, int, int], np.ndarray]:
+    """The bounding box x1, y1, x2, y2 of the mask that `decode_rle` gives, half-open, and its pixels there, (y2 - y1,
+    x2 - x1) bool, without the rest of the image; of a mask without pixels one that is not set, (0, 0, 1, 1).
+
+    Raises:
+        InputError: the counts do not add up to the image.
+    """
+    runs = _read_runs(counts, width, height)
+    ends = runs.cumsum()
+    stops = ends[1::2]
+    starts = ends[::2][: len(stops)]
+    starts, stops = starts[stops > starts], stops[stops > starts]
+    if not len(stops):
+        return (0, 0, 1, 1), np.zeros((1, 1), bool)
+    left, right = int(starts[0]) // height, (int(stops[-1]) - 1) // height + 1
+    # a run that goes on in the next column holds the bottom of the one and the top of the other
+    is_whole = bool((starts // height < (stops - 1) // height).any())
+    top, bottom = (0, height) if is_whole else (int((starts % height).min()), int(((stops - 1) % height).max()) + 1)
+    borders = np.clip(ends, left * height, right * height) - left * height
+    strip = np.repeat(np.arange(len(runs)) % 2 == 1, np.diff(borders, prepend=0))
+    return (left, top, right, bottom), strip.reshape(right - left, height)[:, top:bottom].T
+
+
+def _read_runs(counts: str | list[int], width: int, height: int) -> NDArray[np.int64]:
+    runs = _decompress(counts) if isinstance(counts, str) else counts
+    if min(runs, default=0) < 0 or sum(runs) != width * height:
+        raise InputError(f"its run lengths do not add up to {width} x {height} pixels")
+    return np.array(runs, np.int64)
+
+
+def _decompress(counts: str) -> list[int]:
+    """Run lengths from COCO's string: 5 bits per character, lowest first, the sixth bit says that more follow; from the
+    fourth run on, the difference from the run before the last."""
+    bits = np.frombuffer(counts.encode("utf-32-le", "surrogatepass"), "<u4").astype(np.int64) - 48
+    last = np.flatnonzero(bits & 0x20 == 0)  # character of each number
+    first = np.append(0, last[:-1] + 1)[: len(last)]
+    lengths = last - first + 1
+    if max(lengths, default=0) > MOST_CHARACTERS:
+        raise InputError("its run lengths are not a string that COCO writes")
+    if not len(last):
+        return []
+    bits = bits[: last[-1] + 1]
+    shifts = 5 * (np.arange(len(bits)) - np.repeat(first, lengths))
+    numbers = np.add.reduceat((bits & 0x1F) << shifts, first)
+    numbers -= (bits[last] & 0x10 != 0) * (1 << 5 * lengths)  # the sign
+    for start in (1, 2):
+        numbers[start::2] = numbers[start::2].cumsum()
+    return [int(number) for number in numbers]
+
+
+def encode_mask(mask: np.ndarray) -> dict[str, Any]:
+    """(H, W) bool -> COCO compressed RLE that json can write."""
+    rle = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
+    return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
