@@ -19,7 +19,8 @@ from mvseg.matching.split import split_merged
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
-from mvseg.verification.choose import Leaves, choose_leaves, expect_right
+from mvseg.verification.choose import Leaves, choose_leaves
+from mvseg.verification.leaf_scores import expect_right
 from mvseg.verification.unexplained import is_familiar
 
 if TYPE_CHECKING:

@@ -19,9 +19,10 @@ from mvseg.poses.refine_poses import RefinedPoses, refine_scene
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
-from mvseg.verification.choose import add_beside, expect_right
+from mvseg.verification.choose import add_beside
 from mvseg.verification.evidence import Drawn, draw_views
 from mvseg.verification.leaf_color import colors_of_leaves
+from mvseg.verification.leaf_scores import expect_right
 
 if TYPE_CHECKING:
     from mvseg.detection.find_leaves import Look

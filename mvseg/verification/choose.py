@@ -129,22 +129,6 @@ def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
     return replace(table, origin=origin, is_linked=is_linked)
 
 
-def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
-    """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks.
-
-    For one plant it orders detectors, and the sizes that they look at, as the truth does (docs/notes/detector.md).
-
-    Args:
-        masks: D masks whose match scores are q.
-        probabilities: {instance id: P}.
-    """
-    chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
-    for instance, chance in probabilities.items():
-        chances[instance] = chance
-    ids = masks.instance_ids.clamp(min=0).cpu()
-    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), CHOICE.digits)
-
-
 def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
     """The masks, and after them the others that show something else than these: see `SHARED`; by view."""
     both = Masks.concatenate((masks, others.with_merged(())))

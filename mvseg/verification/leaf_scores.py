@@ -6,13 +6,15 @@ maximum likelihood. Not in the paper.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from scipy.special import expit, logit
 
+from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.verification.evidence import Bools, Evidence, Floats, Ints
 from mvseg.verification.numbers import CHOICE
@@ -171,6 +173,22 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
             first = q[rows].argmax(0)
             best[view], row[view] = q[rows][first, np.arange(q.shape[1])], rows[first]
     return best, row
+
+
+def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
+    """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks.
+
+    For one plant it orders detectors, and the sizes that they look at, as the truth does (docs/notes/detector.md).
+
+    Args:
+        masks: D masks whose match scores are q.
+        probabilities: {instance id: P}.
+    """
+    chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
+    for instance, chance in probabilities.items():
+        chances[instance] = chance
+    ids = masks.instance_ids.clamp(min=0).cpu()
+    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), CHOICE.digits)
 
 
 def log_odds(values: Floats) -> Floats:

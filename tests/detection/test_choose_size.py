@@ -21,7 +21,7 @@ from mvseg.errors import warn
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_leaves import find_in_photos
-from mvseg.verification.choose import expect_right
+from mvseg.verification.leaf_scores import expect_right
 
 
 def squares(views: int, *, side: int = 20, score: float = 0.9) -> Masks:
