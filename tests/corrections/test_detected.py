@@ -6,6 +6,7 @@ import io
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +26,8 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras, Scene, View
 from mvseg.system.running import running
 from mvseg.verification import choose as choosing
+from mvseg.verification.choose import Leaves
+from mvseg.verification.evidence import Drawn
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 REGIONS, IDS = as_regions(true_maps())
@@ -147,3 +150,26 @@ def test_what_is_known_without_a_person_is_found_once() -> None:
     once, twice = (apply_edits(known, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))
     assert torch.equal(once.masks.instance_ids, twice.masks.instance_ids)
     assert len(known.instances.probabilities) == 3
+
+
+def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    edit = Reject(view="v0", at=at(1, 0), everywhere=True)
+    expected, known, used = run(edit), run(), []
+
+    def choose(*given: Masks, drawn: tuple[Drawn, ...], **options: Any) -> Leaves:
+        used.append(drawn)
+        return choosing.choose_leaves(*given, drawn=drawn, **options)
+
+    known.draw_ahead()
+    ahead = known.drawn
+    assert all("is_shared" in vars(each) for each in ahead)
+    for name in ("known.draw_views", "known.add_beside"):
+        monkeypatch.setattr(f"mvseg.pipeline.{name}", None)  # nobody waits for these again
+    monkeypatch.setattr("mvseg.pipeline.apply_edits.choose_leaves", choose)
+    found = apply_edits(known, Corrections((edit,)))
+    assert used == [ahead]
+    assert found.instances.probabilities == expected.instances.probabilities
+    assert [each.chance for each in found.left] == [each.chance for each in expected.left]
+    for name in ("instance_ids", "match_scores", "origin"):
+        assert torch.equal(getattr(found.masks, name), getattr(expected.masks, name))
+    assert torch.equal(found.masks.regions.crops, expected.masks.regions.crops)
