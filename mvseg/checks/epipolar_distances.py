@@ -64,7 +64,7 @@ def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
     """
     if len(matches) < FEATURES.fewest_pairs:
         return 1.0
-    cost = np.array([[_median_distance(pair, cameras, factor) for pair in matches] for factor in FACTORS])
+    cost = np.stack([_median_distances(pair, cameras, FACTORS) for pair in matches], 1)
     best, given = int(np.median(cost, axis=1).argmin()), len(FACTORS) // 2
     is_inside = 0 < best < len(FACTORS) - 1
     is_far = abs(np.log(FACTORS[best])) > FEATURES.least_error
@@ -91,23 +91,25 @@ def fundamental(views: tuple[int, int], cameras: Cameras) -> Floats:
 
 
 def epipolar_distances(xy: Floats, F: Floats) -> Floats:
-    """(N,) pixels, Sampson's distance of points (2, N, 2) of two views: of both photos together."""
-    one, other = np.concatenate((xy, np.ones_like(xy[..., :1])), 2)
+    """(..., N) pixels, Sampson's distance of points (..., 2, N, 2) of two views: of both photos together."""
+    one, other = np.moveaxis(np.concatenate((xy, np.ones_like(xy[..., :1])), -1), -3, 0)
     lines, back = one @ F.T, other @ F
-    slope = np.hypot(np.hypot(lines[:, 0], lines[:, 1]), np.hypot(back[:, 0], back[:, 1]))
-    return np.asarray(np.abs((other * lines).sum(1)) / slope.clip(min=1e-300))
+    slope = np.hypot(np.hypot(lines[..., 0], lines[..., 1]), np.hypot(back[..., 0], back[..., 1]))
+    return np.asarray(np.abs((other * lines).sum(-1)) / slope.clip(min=1e-300))
 
 
-def _median_distance(pair: PhotoMatches, cameras: Cameras, factor: float = 1) -> float:
-    """Units, median epipolar distance of the features that fit one fundamental matrix, with focal lengths `factor`
+def _median_distances(pair: PhotoMatches, cameras: Cameras, factors: Floats) -> Floats:
+    """(F,) units, median epipolar distance of the features that fit one fundamental matrix, with focal lengths so many
     times as long: as if the photos were as much smaller about their principal points."""
     centers = cameras.K[list(pair.views), None, :2, 2].numpy()
-    xy = (pair.xy[:, pair.is_rigid] - centers) / factor + centers
-    return float(np.median(epipolar_distances(xy, fundamental(pair.views, cameras)))) * factor / pair.unit_px
+    xy = (pair.xy[:, pair.is_rigid] - centers) / factors[:, None, None, None] + centers
+    distances = epipolar_distances(xy, fundamental(pair.views, cameras))
+    return np.asarray(np.median(distances, -1) * factors / pair.unit_px)
 
 
 def _median_px(matches: Sequence[PhotoMatches], cameras: Cameras, factor: float = 1) -> float:
-    return float(np.median([_median_distance(pair, cameras, factor) * pair.unit_px for pair in matches]))
+    medians = [_median_distances(pair, cameras, np.array([factor])) * pair.unit_px for pair in matches]
+    return float(np.median(medians))
 
 
 def _pose_rules(significant: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Rule]:
