@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import gc
+import hashlib
 import os
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from mvseg import demo
+from mvseg.checks import photo_matches
+from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair
 from mvseg.cli import command
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.poses.sift import Sift
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from mvseg.system import worker_pool
@@ -23,6 +30,7 @@ from mvseg.system import worker_pool
 ROOT = Path(__file__).parent.parent
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tests
+cv2.setNumThreads(1)  # OMP_NUM_THREADS does not bound its threads, and they spin while they wait
 gc.disable()  # until all modules are there: a search among what they keep takes a third of a second, and finds nothing
 
 
@@ -44,6 +52,30 @@ def one_worker() -> Iterator[None]:
     """Commands fit surfaces in the process of the test: another one would load all libraries for some leaves."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "default_workers", lambda: 1)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_look() -> Iterator[None]:
+    """Features of equal photos are found once, and matched once, whatever looks at them: checks, and each run."""
+    found: dict[Any, Sift] = {}
+    matched: dict[Any, PhotoMatches] = {}
+
+    def find(photo: np.ndarray) -> Sift:
+        key = photo.shape, hashlib.sha256(photo.tobytes()).digest()
+        if key not in found:
+            found[key] = find_features(photo)
+        return found[key]
+
+    def match(views: tuple[int, int], first: Sift, second: Sift, *, unit_px: float) -> PhotoMatches:
+        key = views, id(first), id(second), unit_px  # `found` keeps them
+        if key not in matched:
+            matched[key] = match_pair(views, first, second, unit_px=unit_px)
+        return matched[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photo_matches, "find_features", find)
+        patch.setattr(photo_matches, "match_pair", match)
         yield
 
 

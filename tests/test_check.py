@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from mvseg.checks.check_scene import check_scene, warn_of_contradictions
-from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair
 from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene as demo_folder
@@ -27,30 +26,6 @@ from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from scene_folders import write_image, write_scene
-
-
-@pytest.fixture(scope="module", autouse=True)
-def once() -> Iterator[None]:
-    """Features of equal photos are found once, and matched once."""
-    found: dict[int, Any] = {}
-    matched: dict[Any, PhotoMatches] = {}
-
-    def find(photo: np.ndarray) -> Any:
-        key = hash(photo.tobytes())
-        if key not in found:
-            found[key] = find_features(photo)
-        return found[key]
-
-    def match(views: tuple[int, int], first: Any, second: Any, *, unit_px: float) -> PhotoMatches:
-        key = (views, id(first), id(second), unit_px)  # `found` keeps them
-        if key not in matched:
-            matched[key] = match_pair(views, first, second, unit_px=unit_px)
-        return matched[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mvseg.checks.photo_matches.find_features", find)
-        patch.setattr("mvseg.checks.photo_matches.match_pair", match)
-        yield
 
 
 @pytest.fixture
@@ -122,9 +97,12 @@ def test_a_wrong_focal_length_is_an_error(masks: bool, plant: Path, capsys: pyte
 @pytest.mark.parametrize(
     ("edit", "expected"), [(move_every_second, "agree within 5 views"), (lengthen, "the focal lengths seem wrong")]
 )
-def test_a_run_warns_of_it(edit: Callable[[int, dict[str, Any]], object], expected: str, plant: Path) -> None:
+def test_a_run_warns_of_it(
+    edit: Callable[[int, dict[str, Any]], object], expected: str, plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     edit_cameras(plant, edit)
-    config = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_size=4.0))
+    monkeypatch.setattr("mvseg.pipeline.finish._measure", lambda result, *_: result)  # no shape is looked at
+    config = RunConfig(reconstruct=ReconstructConfig(shape="voxels"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         run_scene(plant, plant / "masks", config)

@@ -39,6 +39,7 @@ ROOT = Path(__file__).parent.parent
 NAN, INF = float("nan"), float("inf")
 # for tests that look at no shape and at no page
 COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--report", "false"]
+SMALL = ["--detect.image_size", "128"]  # for those that look at no detection: one size, and as large as the photos are
 Break = Callable[[Path], None]
 
 
@@ -277,7 +278,7 @@ def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.
 def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every stage that takes minutes on a large scene has a bar, matching between detections and shapes too."""
     plant = write_scene(tmp_path / "plant", 3)
-    options = ["--detect.min_score", "0.05", "--out", str(tmp_path / "out"), *COARSE[:-2]]
+    options = [*SMALL, "--detect.min_score", "0.05", "--out", str(tmp_path / "out"), *COARSE[:-2]]
     assert main(["infer", str(plant), *options]) == 0
     said = capsys.readouterr().err
     stages = ["detection", "epipolar weights", "rays, 1 px", "search", "back-projection", "pictures", "masks"]
@@ -288,7 +289,7 @@ def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plant, unverified = write_scene(tmp_path / "plant", 2), [*COARSE, "--detect.verify", "false"]
+    plant, unverified = write_scene(tmp_path / "plant", 2), [*COARSE, *SMALL, "--detect.verify", "false"]
     kept, said = tmp_path / "out.detections", "mvseg: going on from the detections in"
     kept.mkdir()
     (kept / f"{'0' * 64}.safetensors").touch()
@@ -681,13 +682,14 @@ BAD_INPUT: dict[str, tuple[Break, str]] = {
 
 
 @pytest.mark.parametrize("name", BAD_INPUT)
-def test_bad_input(name: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input(name: str, plant: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """What libraries write to stderr by themselves would show, too."""
     change, message = BAD_INPUT[name]
     change(plant)
     masks = "masks.json" if (plant / "masks.json").exists() else "masks"
     before = sorted(tmp_path.rglob("*"))
     assert main(["infer", str(plant), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet", *COARSE]) == 2
-    assert message in complaint(capsys)
+    assert message in complaint(capfd)
     assert sorted(tmp_path.rglob("*")) == before  # no result, and nothing half of one
 
 
@@ -736,6 +738,7 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
     """Libraries that write to stderr by themselves would show here: one sentence per broken scene, and nothing else."""
     names = ["JPEG cut", "images.bin cut at 0.2", "mask cut"]
@@ -980,7 +983,8 @@ def test_match_without_masks_is_refused(plant: Path, tmp_path: Path, capsys: pyt
 
 def test_a_detector_that_finds_nothing_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant = write_scene(tmp_path / "plant", 2)
-    assert main(["infer", str(plant), "--detect.min_score", "1", "--quiet", "--out", str(tmp_path / "out")]) == 0
+    command = ["infer", str(plant), *SMALL, "--detect.min_score", "1", "--quiet", "--out", str(tmp_path / "out")]
+    assert main([*command, *COARSE]) == 0
     assert "the detector finds nothing that scores 1 or more" in capsys.readouterr().err
 
 

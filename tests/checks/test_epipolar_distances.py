@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +20,7 @@ from mvseg.checks.epipolar_distances import (
 )
 from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair, match_photos, neighbours
 from mvseg.errors import InputError
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.poses.sift import Sift
 from mvseg.scene import Cameras, Scene
@@ -29,20 +29,14 @@ from two_worlds import every_second_farther, half_turned
 NAMES = tuple(f"{view:03d}" for view in range(9))
 
 
-Look = Callable[[Cameras], list[PhotoMatches]]
+@pytest.fixture(scope="module")
+def photos(demo_scene: Scene) -> Photos:
+    return Photos(demo_scene)
 
 
 @pytest.fixture(scope="module")
-def look(demo_scene: Scene) -> Look:
-    """What the photos of the shipped plant share where these cameras say what is near; each pair is matched once."""
-    features = {view: find_features(read_photo(demo_scene, view)) for view in range(9)}
-    match = cache(lambda i, j, unit_px: match_pair((i, j), features[i], features[j], unit_px=unit_px))
-    return lambda cameras: [match(*pair, cameras.unit_px) for pair in neighbours(cameras)]
-
-
-@pytest.fixture(scope="module")
-def shared(demo_scene: Scene) -> list[PhotoMatches]:
-    return match_photos(partial(read_photo, demo_scene), demo_scene.cameras)
+def shared(photos: Photos, demo_scene: Scene) -> list[PhotoMatches]:
+    return match_photos(photos, demo_scene.cameras)
 
 
 def say(shared: list[PhotoMatches], cameras: Cameras) -> list[tuple[str, tuple[int, ...]]]:
@@ -55,8 +49,7 @@ def one_turned(cameras: Cameras) -> Cameras:
     return replace(cameras, R=R)
 
 
-def test_right_cameras_have_no_finding(shared: list[PhotoMatches], look: Look, demo_scene: Scene) -> None:
-    assert [pair.views for pair in look(demo_scene.cameras)] == [pair.views for pair in shared]
+def test_right_cameras_have_no_finding(shared: list[PhotoMatches], demo_scene: Scene) -> None:
     significant = [pair for pair in shared if pair.is_significant]
     assert len(significant) >= 8
     assert focal_factor(significant, demo_scene.cameras) == 1
@@ -85,14 +78,10 @@ def test_a_wrong_focal_length_is_measured(factor: float, shared: list[PhotoMatch
     ids=["t x 1.1", "half turned", "turned the other way", "one turned", "cameras of the previous photo"],
 )
 def test_wrong_poses_are_named(
-    fault: Callable[[Cameras], Cameras],
-    views: tuple[int, ...],
-    named: str,
-    look: Look,
-    demo_scene: Scene,
+    fault: Callable[[Cameras], Cameras], views: tuple[int, ...], named: str, photos: Photos, demo_scene: Scene
 ) -> None:
     cameras = fault(demo_scene.cameras)
-    shared = look(cameras)  # wrong about what is near, too
+    shared = match_photos(photos, cameras)  # wrong about what is near, too
     ((what, found),) = say(shared, cameras)
     assert named in what
     assert found == views
@@ -103,12 +92,11 @@ def test_a_common_scale_is_invisible(shared: list[PhotoMatches], demo_scene: Sce
     assert say(shared, demo_scene.cameras.scale(3.0)) == []
 
 
-def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], demo_scene: Scene) -> None:
+def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], photos: Photos, demo_scene: Scene) -> None:
     """A wall behind a turntable is seen at the same pixels of all photos."""
     still = [replace(pair, num_still=2 * pair.xy.shape[1]) for pair in shared]
     assert say(still, scale_focal(demo_scene.cameras, 0.5)) == []
-    photo = read_photo(demo_scene, 3)
-    same = match_photos(lambda _: photo, demo_scene.cameras[:3])
+    same = match_photos(lambda _: photos(3), demo_scene.cameras[:3])
     assert all(pair.xy.shape[1] == 0 for pair in same)
     assert all(pair.num_still > 50 for pair in same)
 
@@ -121,11 +109,11 @@ def test_plain_photos_tell_nothing(demo_scene: Scene) -> None:
     assert say(shared, scale_focal(demo_scene.cameras, 0.5)) == []
 
 
-def test_photos_that_cannot_be_read_are_left_out(demo_scene: Scene) -> None:
+def test_photos_that_cannot_be_read_are_left_out(photos: Photos, demo_scene: Scene) -> None:
     def read(view: int) -> np.ndarray:
         if view == 3:
             raise InputError("broken")
-        return read_photo(demo_scene, view)
+        return photos(view)
 
     shared = match_photos(read, demo_scene.cameras[:5])
     assert {view for pair in shared for view in pair.views} == {0, 1, 2, 4}
@@ -170,7 +158,7 @@ def test_epipolar_distances_are_pixels(demo_scene: Scene) -> None:
 def test_real_photos_accuse_wrong_focal_lengths_only(shared_data: Path) -> None:
     scene = load_scene(shared_data / "basil-0729")
     names = tuple(view.name for view in scene.views)
-    shared = match_photos(partial(read_photo, scene), scene.cameras)
+    shared = match_photos(Photos(scene), scene.cameras)
     assert distance_findings(shared, scene.cameras, names) == []
     (found,) = distance_findings(shared, scale_focal(scene.cameras, 1.1), names)
     assert found.what.startswith("the focal lengths seem wrong")
