@@ -27,11 +27,12 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import FORMAT, Corrections, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
-from mvseg.errors import InputError
+from mvseg.errors import InputError, warn
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline.known import match_given
+from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import regions_from_label_maps
@@ -220,6 +221,19 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     with pytest.raises(Cancelled):
         opened.recompute(corrections, lambda: True)
     (folder / "corrections.json").unlink()
+
+
+def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened = OpenResult(folder)
+    opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"warnings": ("2 masks are cut off",)}))
+
+    def shape(known: Known) -> Result:
+        warn("3 masks are cut off")
+        warn("a photo is dark")
+        return shape_leaves(known)
+
+    monkeypatch.setattr("mvseg.server.open_result.shape_leaves", shape)
+    assert opened.recompute(Corrections(), lambda: False)[2] == ["A photo is dark."]
 
 
 def test_it_opens_with_what_the_run_knew_before_edits(

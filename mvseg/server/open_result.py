@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -173,7 +174,8 @@ class OpenResult:
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
-        and the other warnings on the way. Leaves keep their numbers from one result to the next, see `keep_numbers`.
+        and, as sentences, the warnings on the way that the run did not give: those are on the page. Leaves keep their
+        numbers from one result to the next, see `keep_numbers`.
 
         Where what was computed is kept (`running`), a surface is fitted anew only if its instance's masks differ from
         those in all results before. (A run from the command line fits all of them: each surface also depends a little
@@ -188,12 +190,10 @@ class OpenResult:
             edited = apply_edits(known, corrections)
             result = shape_leaves(edited)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
-        told = {fate.message for fate in shown.fates}
-        return (
-            shown,
-            [describe_fate(fate) for fate in shown.fates],
-            [text for text in dict.fromkeys(messages + more) if text not in told],
-        )
+        told = {_without_numbers(text) for text in (*self.run.said.warnings, *(fate.message for fate in shown.fates))}
+        new = {_without_numbers(text): text for text in messages + more}
+        said = [f"{text[:1].upper()}{text[1:]}." for words, text in new.items() if words not in told]
+        return shown, [describe_fate(fate) for fate in shown.fates], said
 
     def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:
         """Let the detector learn the leaves that the views agree about, and those that a person outlined, in one round;
@@ -281,6 +281,11 @@ class OpenResult:
         path, said = self.folder / BEFORE_EDITS_FILE, self.run.said
         is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
         return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None
+
+
+def _without_numbers(text: str) -> str:
+    """Edits change by how many degrees or masks something is so: a warning that differs in that only is no news."""
+    return re.sub(r"\d+", "", text)
 
 
 def _read_detector(folder: Path) -> bytes | None:

@@ -355,7 +355,9 @@ def test_the_most_doubtful_is_asked_first_and_answered_by_a_key(
     assert person.page.locator("#correct-ask p").inner_text().startswith(f"Photo {name}: is this leaf 3?")
     person.page.keyboard.press("s")
     assert person.page.locator("#correct-ask p").inner_text().startswith(f"Photo {name}: is this leaf 1?")
-    person.page.keyboard.press("n")  # not now: there is nothing else, so it comes again
+    person.page.keyboard.press("n")  # not now: there is nothing else, so it comes again, if it is asked for
+    assert "1 question " in person.page.locator("#correct-ask").inner_text()
+    person.page.keyboard.press("n")
     assert "leaf 1?" in person.page.locator("#correct-ask p").inner_text()
     person.page.keyboard.press("r")
     assert person.page.locator("#correct-note").inner_text() == "Nothing doubtful is left."
@@ -402,6 +404,7 @@ def test_an_outline_is_an_answer(browser: sync_api.Browser, balls: Result, tmp_p
     person = Person(browser, write_page(tmp_path / "report.html", replace(balls, matching=doubtful)))
     assert "10 questions " in person.page.locator("#correct-ask").inner_text()
     person.page.keyboard.press("n")
+    assert person.page.locator("#correct-ask h2").inner_text() == "Question 1 of 10"
     view, (x, y), other = person.page.evaluate(
         "(() => { const { doubt } = modes.work; return [doubt.view, doubt.mask.at, doubt.otherView]; })()"
     )
@@ -413,6 +416,12 @@ def test_an_outline_is_an_answer(browser: sync_api.Browser, balls: Result, tmp_p
     assert (outline["op"], outline["view"]) == ("outline", names[view])
     assert (same["op"], [place[0] for place in same["at"]]) == ("same", [names[view], names[other]])
     assert person.page.locator("#correct-ask p").inner_text().startswith("Photo")  # the next one
+    assert person.page.locator("#correct-ask h2").inner_text() == "Question 2 of 10"
+    for _ in range(9):
+        person.page.keyboard.press("n")
+    assert "1 question " in person.page.locator("#correct-ask").inner_text()
+    note = person.page.locator("#correct-note").inner_text()
+    assert note == "These were the questions; those that are left can be asked."
     person.close()
 
 

@@ -11,7 +11,8 @@ class Work {
     this.radius = RADIUS.start;
     this.frames = data.views.map((view, index) => new Frame(view, data.correct.views[index], data.correct.lenses));
     this.edits = new Edits(data.correct, data.views);
-    this.skipped = new Set();
+    this.skipped = new Set(); // names of questions that were asked
+    this.numAsked = 0; // of this round
     this.read();
     this.panes = [new Pane(this), new Pane(this)];
     this.active = this.panes[0];
@@ -75,7 +76,9 @@ class Work {
       pane.element.classList.toggle("drawing", this.tool !== null);
     }
     this.thumbnails.forEach((one, view) => {
-      one.classList.toggle("shown", this.panes.some((pane) => pane.view === view));
+      const isShown = this.panes.some((pane) => pane.view === view);
+      if (isShown && !one.classList.contains("shown")) one.scrollIntoView({ block: "nearest", inline: "nearest" });
+      one.classList.toggle("shown", isShown);
       one.classList.toggle("picked", this.picks.some((pick) => pick.view === view));
     });
     this.panel.show();
@@ -126,15 +129,27 @@ class Work {
 
   next() {
     if (this.doubt) this.skipped.add(this.doubt.name);
-    const open = this.open.slice(0, MOST_ASKED);
-    let left = open.filter((doubt) => !this.skipped.has(doubt.name));
-    if (!left.length && open.length) {
-      this.skipped.clear();
-      left = open;
-    }
+    const { left } = this;
     this.drop();
-    if (left.length) this.ask(left[0]);
-    else this.say("Nothing doubtful is left.");
+    if (left.length && this.numAsked < MOST_ASKED) {
+      this.numAsked += 1;
+      return this.ask(left[0]);
+    }
+    this.numAsked = 0;
+    if (!left.length) this.skipped.clear();
+    this.say(this.open.length ? "These were the questions; those that are left can be asked." : "Nothing doubtful is left.");
+  }
+
+  // The questions that are open and were not asked yet, the one that is asked now included.
+  get left() {
+    return this.open.filter((doubt) => !this.skipped.has(doubt.name));
+  }
+
+  // An answered question may stay open until the masks that follow are known.
+  goOn(answered) {
+    if (!answered) return;
+    this.skipped.add(answered.name);
+    this.next();
   }
 
   ask(doubt) {
@@ -167,7 +182,7 @@ class Work {
     if (!found.length) return;
     this.note = "";
     this.add(found);
-    if (wasAsked) this.next();
+    this.goOn(wasAsked);
   }
 
   editsOf(op, everywhere) {
@@ -310,7 +325,7 @@ class Work {
     if (points.length < 3) return this.discard("Nothing is left of it.");
     const wasAsked = this.doubt;
     this.add(this.drawnEdits(pane.view, points, leaf));
-    if (wasAsked && wasAsked.kind !== "place") this.next();
+    if (wasAsked?.kind !== "place") this.goOn(wasAsked); // there may be more leaves
   }
 
   // The outline as it was before it was fitted to the leaf.
@@ -377,7 +392,7 @@ function rejectedMasks(places, views) {
 
 // Changes between looking at the result and correcting it.
 function buildModes(data, addresses) {
-  const parts = { look: document.querySelectorAll("main, #run"), correct: document.querySelectorAll("#correct") };
+  const parts = { look: document.querySelectorAll("main, #card, #run"), correct: document.querySelectorAll("#correct") };
   const buttons = { look: document.getElementById("mode-look"), correct: document.getElementById("mode-correct") };
   const modes = { work: null, show };
   function show(mode) {

@@ -72,17 +72,19 @@ class Panel {
   }
 
   question() {
-    const { doubt, open } = this.work;
-    const asked = Math.min(open.length, MOST_ASKED);
+    const { doubt, open, left, numAsked, draft } = this.work;
     if (!doubt) {
+      const asked = Math.min(left.length || open.length, MOST_ASKED);
       const text = open.length
         ? `${count(asked, "question")} about what may be wrong, those first whose answers change most.`
         : "Nothing doubtful is left.";
       const ask = this.action("next", "Ask me", { disabled: !open.length, main: true });
       return [element("h2", {}, "Questions"), element("p", {}, text), ask];
     }
-    const answers = answersTo(doubt).map(([name, text], n) => this.action(name, text, { main: n === 0 }));
-    return [element("h2", {}, `Question (${asked} left)`), element("p", {}, askAbout(doubt, this.work)),
+    const last = Math.max(numAsked, Math.min(MOST_ASKED, numAsked + left.length - 1));
+    const answers = answersTo(doubt).map(([name, text], n) => this.action(name, text, { main: n === 0 && !draft }));
+    const title = numAsked ? `Question ${numAsked} of ${last}` : "Question";
+    return [element("h2", {}, title), element("p", {}, askAbout(doubt, this.work)),
       element("div", { class: "answers" }, ...answers)];
   }
 

@@ -6,13 +6,17 @@ function summarise(data) {
     `${leaves}, ${count(data.views.length, "photo")}, ${count(data.numMasks, "mask")}; lengths in ${data.unit}`;
 }
 
+// The card is for terminals, too, which may know ASCII only.
+function inSymbols(text) {
+  return text.replaceAll(" +- ", " \u00b1 ").replace(/\^2\b/g, "\u00b2");
+}
+
 function buildCard(card) {
   const place = document.getElementById("card");
   const lines = card ? [["found", card.found], ["in doubt", card.doubt], ["next", card.next_step]] : [];
   const terms = lines.filter(([, text]) => text)
-    .flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, text)]);
-  place.append(element("dl", {}, ...terms));
-  place.hidden = terms.length === 0;
+    .flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, inSymbols(text))]);
+  if (terms.length) place.append(element("dl", {}, ...terms));
 }
 
 function buildRun(data) {
