@@ -187,14 +187,19 @@ class Look:
 
     def outline(self, leaf: int, view: int) -> Outline:
         """The largest visible piece of a leaf, drawn by hand."""
-        shown = (self.truth[view] == leaf).astype(np.uint8)
-        lines, _ = cv2.findContours(np.pad(shown, 1), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        shown = np.pad(self.piece(leaf, view), 1).astype(np.uint8)
+        lines, _ = cv2.findContours(shown, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         points = np.asarray(cv2.approxPolyDP(max(lines, key=len), OUTLINE_PX, True)[:, 0] - 0.5, np.float64)
         if len(points) < 3:
             x, y, w, h = cv2.boundingRect(max(lines, key=len))
             points = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]]) - 1.0
         polygon = [(float(x), float(y)) for x, y in self._to_photo(view, points)]
         return Outline(view=self.scene.views[view].name, polygon=tuple(polygon), leaf=f"leaf {leaf}")
+
+    def piece(self, leaf: int, view: int) -> NDArray[np.bool_]:
+        """(H, W) the largest piece of what a photo shows of a leaf."""
+        count, pieces, stats, _ = cv2.connectedComponentsWithStats((self.truth[view] == leaf).astype(np.uint8))
+        return np.asarray(pieces == (1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else -1))
 
     def inside(self, view: int, outline: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(H, W) the pixels in an outline of the queue."""
@@ -376,9 +381,7 @@ def _draw(look: Look) -> list[Repair]:
 
 def _inside(look: Look, leaf: int, view: int) -> tuple[float, float]:
     """A point of a leaf's largest piece in a photo."""
-    count, pieces, stats, _ = cv2.connectedComponentsWithStats((look.truth[view] == leaf).astype(np.uint8))
-    largest = 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax()) if count > 1 else 0
-    depth = np.asarray(cv2.distanceTransform(np.pad(pieces == largest, 1).astype(np.uint8), cv2.DIST_L2, 5))
+    depth = np.asarray(cv2.distanceTransform(np.pad(look.piece(leaf, view), 1).astype(np.uint8), cv2.DIST_L2, 5))
     y, x = np.unravel_index(int(depth.argmax()), depth.shape)
     (xy,) = look._to_photo(view, np.array([[x - 0.5, y - 0.5]]))
     return float(xy[0]), float(xy[1])

@@ -17,7 +17,7 @@ def seen_ids(masks: Masks, before: Masks) -> Tensor:
 
 
 def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
-    """The leaves that edits leave as they were, or confirm: none of their masks is gone, changed, kept apart from
+    """The leaves that a person speaks of and that are as he says: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.
 
     Args:
@@ -39,7 +39,8 @@ def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
         (left != all_of).nonzero()[:, 0],
         before.instance_ids[before.origin != Origin.DETECTED],  # the views did not choose these
     )
-    leaves = before.instance_ids[before.instance_ids > 0].unique()
+    named = ids[corrected.masks.is_corrected | corrected.masks.is_linked]
+    leaves = named[named > 0].unique()
     return leaves[~torch.isin(leaves, torch.cat(changed))]
 
 

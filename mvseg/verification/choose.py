@@ -90,34 +90,30 @@ def choose_leaves(
     """
     matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
     proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
-    is_held = matched.is_corrected | matched.is_linked
-    is_held |= (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
     seen = torch.full_like(matched.instance_ids, -1) if seen is None else seen.cpu()
-    ids = matched.instance_ids
-    is_apart = (
-        matched.is_linked & ~matched.is_corrected & (ids < 1)
-    )  # all that is said of it: which leaf it does not show
-    is_added = ~_are_proposals(matched, proposals) | (
-        is_held & (seen < 1)
-    )  # what a person made, and what was cut since
+    ids, origin, stays = matched.instance_ids, matched.origin, seen > 0
+    is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
+    is_sure = is_held & ~(matched.is_linked & ~matched.is_corrected & (ids < 1))  # the others: not of one leaf, is said
+    is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # a person's, and what was cut since
     added = matched.select(is_added)
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
     table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
-    leaf = seen.where(~is_added, -1)
-    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_held & ~is_apart, leaf=leaf)
-    has_shapes = _is_seen_around(matched, cameras)
+    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=seen.where(~is_added, -1))
+    usable = np.ones(len(table), bool)
     if gone is not None:
-        ids = ids.where(torch.isin(ids, ids[is_held & (seen < 1)]) & (seen < 1), -1)
-        gone = Masks.concatenate((gone.to("cpu").with_merged(()), matched.select(is_apart).with_merged(())))
+        ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
+        others = Masks.concatenate((gone.to("cpu"), matched.select(is_held & ~stays)))
+        usable[: len(proposals)] = _without(proposals, others)
     found = [(replace(matched, instance_ids=ids), row_of)]
     found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
+    has_shapes = _is_seen_around(matched, cameras)
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
     views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
-    usable = np.concatenate((_without(proposals, gone), np.ones(len(added), bool)))
+    is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
     for each in views:
-        is_sure = said.is_sure[each.rows]
-        usable[each.rows] &= is_sure | ~each.is_shared[:, is_sure].any(1)
+        own = is_made[each.rows]
+        usable[each.rows] &= own | ~each.is_shared[:, own].any(1)
     chosen = choose(candidates, table, drawn=views, usable=usable, said=said, min_probability=min_probability)
     return _take(chosen, candidates, table, is_held=said.is_sure)
 
@@ -160,14 +156,12 @@ def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
     return parallax >= ROUGH.least_parallax
 
 
-def _without(proposals: Masks, gone: Masks | None) -> Bools:
-    """(R,) bool: the proposals that are not masks which a person took away, by `EVIDENCE.fits`."""
+def _without(proposals: Masks, others: Masks) -> Bools:
+    """(R,) bool: the proposals that show something else than other masks do, by `EVIDENCE.fits`."""
     stays = np.ones(len(proposals), bool)
-    if gone is None:
-        return stays
-    for row in range(len(gone)):
-        mask = gone.regions.placed(row)
-        for other in (proposals.view_index == gone.view_index[row]).nonzero()[:, 0].tolist():
+    for row in range(len(others)):
+        mask = others.regions.placed(row)
+        for other in (proposals.view_index == others.view_index[row]).nonzero()[:, 0].tolist():
             stays[other] &= proposals.regions.placed(other).iou(mask) <= EVIDENCE.fits
     return stays
 

@@ -19,7 +19,10 @@ BEFORE = Masks.of(REGIONS, IDS, origin=Origin.DETECTED)
 ONE, TWO, THREE = ((leaf == IDS).nonzero()[:, 0].tolist() for leaf in (1, 2, 3))
 
 
-def stay(masks: Masks = BEFORE, before: Masks = BEFORE, *, whole: tuple[Whole, ...] = (), **links: object) -> list[int]:
+NAMED = replace(BEFORE, is_linked=torch.ones(len(IDS), dtype=torch.bool))
+
+
+def stay(masks: Masks = NAMED, before: Masks = BEFORE, *, whole: tuple[Whole, ...] = (), **links: object) -> list[int]:
     said = Links.of(**links)  # type: ignore[arg-type]
     edited = Corrected(masks, said, torch.zeros(len(masks)), whole, (), ())
     return leaves_as_seen(edited, seen_ids(masks, before), before).tolist()
@@ -28,6 +31,7 @@ def stay(masks: Masks = BEFORE, before: Masks = BEFORE, *, whole: tuple[Whole, .
 def test_what_says_what_is_seen_changes_no_leaf() -> None:
     assert stay() == [1, 2, 3]
     assert stay(must=[(ONE[0], ONE[2])], cannot=[(ONE[1], TWO[1])], whole=(Whole(1, THREE[0], False),)) == [1, 2, 3]
+    assert stay(replace(BEFORE, is_linked=torch.arange(len(IDS)) == TWO[1])) == [2]
     order = torch.randperm(len(IDS), generator=torch.Generator().manual_seed(0))
     assert seen_ids(BEFORE.select(order), BEFORE).tolist() == IDS[order].tolist()
 
@@ -38,7 +42,7 @@ def test_what_says_what_is_seen_changes_no_leaf() -> None:
         ({"must": [(ONE[0], TWO[2])]}, [3]),
         ({"cannot": [(ONE[0], ONE[2])]}, [2, 3]),
         ({"whole": (Whole(1, TWO[0], True),)}, [1, 3]),
-        ({"masks": BEFORE.select(torch.arange(len(IDS)) != THREE[1])}, [1, 2]),
+        ({"masks": NAMED.select(torch.arange(len(IDS)) != THREE[1])}, [1, 2]),
         ({"before": replace(BEFORE, origin=BEFORE.origin.where(IDS != 1, int(Origin.FEW_VIEWS)))}, [2, 3]),
         ({"before": replace(BEFORE, instance_ids=IDS.where(torch.arange(len(IDS)) != ONE[0], -1))}, [1, 2, 3]),
         (
