@@ -99,9 +99,9 @@ def _has_error(findings: Sequence[Finding]) -> bool:
     return any(finding.level == "error" for finding in findings)
 
 
-def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | None = None) -> None:
-    """Warn (InputWarning) of masks of turned photos, of views that agree in groups only, and of focal lengths that the
-    photos contradict.
+def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | None = None) -> tuple[Finding, ...]:
+    """Warn (InputWarning) of masks of turned photos, of views that agree in groups only, and of poses and focal lengths
+    that the photos contradict; returns what was found.
 
     Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
 
@@ -120,6 +120,7 @@ def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | N
         findings += _compare_photos(photos, scene, only_focal=bool(findings))
     for finding in findings:
         warn(finding.what)
+    return tuple(findings)
 
 
 def _compare_photos(photos: Photos, scene: Scene, *, only_focal: bool) -> list[Finding]:

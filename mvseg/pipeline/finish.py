@@ -35,7 +35,8 @@ def finish(known: Known) -> Result:
     result = replace(result, missing=missing, disagreement=known.disagreement)
     with timed("check"):
         has_photos = config.reconstruct is not None and known.opened.photos.exist
-        warn_of_contradictions(result.scene, result.regions, photos=known.opened.photos if has_photos else None)
+        photos = known.opened.photos if has_photos else None
+        result = replace(result, contradictions=warn_of_contradictions(result.scene, result.regions, photos=photos))
     return result if config.reconstruct is None else _measure(result, config, config.reconstruct)
 
 

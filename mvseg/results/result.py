@@ -14,6 +14,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
+    from mvseg.checks.finding import Finding
     from mvseg.corrections.corrected import Fate
     from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -104,6 +105,7 @@ class Result:
         left: candidates that the views did not choose, the most likely leaf first.
         missing: leaves that the detector probably missed.
         disagreement: a sentence, where the views hardly agree and ids may be wrong; "" elsewhere.
+        contradictions: what the masks and the photos say against the cameras.
         poses: outcome of their refinement; None if it was not requested.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
@@ -124,6 +126,7 @@ class Result:
     left: tuple[LeftOut, ...] = ()
     missing: Missing | None = None
     disagreement: str = ""
+    contradictions: tuple[Finding, ...] = ()
     poses: RefinedPoses | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""

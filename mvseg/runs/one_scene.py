@@ -80,7 +80,7 @@ def run_one_scene(
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if config.views else "; --views all takes all"
             print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
-        card, is_shown = make_card(result, out, scene=scene), now_running().progress
+        card, is_shown = make_card(result, out, scene=scene, masks=masks), now_running().progress
         for message in messages:
             if not (is_shown and card.doubt and card.doubt in message):
                 print(f"mvseg: warning: {message}", file=sys.stderr)
@@ -192,7 +192,7 @@ def save_scene(
     masks. `output`: what may be replaced."""
     run = describe_run(result, masks, config, messages=messages)
     corrections = None if result.corrections is None else result.corrections.source
-    run["card"] = asdict(make_card(result, out, scene=scene))
+    run["card"] = asdict(make_card(result, out, scene=scene, masks=masks))
     run["config"] |= record_places(scene, out, masks, corrections)
     if config.report:
         # of what features say the run has warned
