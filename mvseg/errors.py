@@ -20,6 +20,10 @@ OWN = {
     "Scene": "load_scene reads one",
     "Matching": "match_regions gives one",
     "Tensor": "torch.as_tensor makes one of an array",
+    "RunConfig": "RunConfig(views=12)",
+    "MatchConfig": "MatchConfig(method='nview')",
+    "ReconstructConfig": "ReconstructConfig(shape='voxels')",
+    "Path | str": "the place of a folder or a file",
 }
 
 
@@ -98,7 +102,7 @@ def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
         given = signature.bind(*args, **kwargs).arguments
         for name in named.keys() & given.keys():
             classes = [each.__name__ for each in type(given[name]).__mro__]
-            if named[name] not in classes:
+            if not {*named[name].split(" | ")} & {*classes}:
                 raise InputError(f"{name} is a {classes[0]}, expected {named[name]} ({OWN[named[name]]})")
         return function(*args, **kwargs)
 

@@ -8,7 +8,16 @@ from typing import Any
 import pytest
 import torch
 
-from mvseg import DetectConfig, MatchConfig, ReconstructConfig, epipolar_map, fit_surfaces, match_regions
+from mvseg import (
+    DetectConfig,
+    MatchConfig,
+    ReconstructConfig,
+    epipolar_map,
+    fit_surfaces,
+    load_scene,
+    match_regions,
+    run_scene,
+)
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
@@ -24,6 +33,9 @@ from mvseg.scene import Scene
         (lambda r, s: match_regions(r, s), r"cameras is a Scene, expected Cameras \(of a scene: scene.cameras\)"),
         (lambda r, s: fit_surfaces(r, r.labels.numpy(), s.cameras), "instance_ids is a ndarray, expected Tensor"),
         (lambda r, s: epipolar_map(r, s.cameras, view=0, xy=[1, 2]), "xy is a list, expected Tensor"),
+        (lambda r, s: match_regions(r, s.cameras, "nview"), r"config is a str, expected MatchConfig \(MatchConfig\("),
+        (lambda r, s: run_scene(s), r"folder is a Scene, expected Path | str \(the place of a folder or a file\)"),
+        (lambda r, s: load_scene(None), "folder is a NoneType, expected Path | str"),
     ],
 )
 def test_arguments_of_another_class_are_refused(

@@ -336,6 +336,8 @@ def test_without_words_there_is_help(capsys: pytest.CaptureFixture[str]) -> None
     ("words", "message"),
     [
         ("infr plant", "there is no verb 'infr', did you mean infer?"),
+        ("--verson", "unrecognized arguments: --verson: did you mean --version?"),
+        ("eval", "eval needs result, truth: mvseg eval --help says more"),
         ("quux", f"there is no verb 'quux', expected one of {', '.join(VERBS)}"),
         ("infer . --num_pionts 3", "unrecognized arguments: --num_pionts 3: did you mean --match.num_points?"),
         ("correct . --no_brower", "unrecognized arguments: --no_brower: did you mean --no_browser?"),

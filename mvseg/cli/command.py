@@ -42,8 +42,8 @@ VERBS: dict[str, tuple[ModuleType, str]] = {
 # The verbs with more options than a screen has lines, and what `--help` shows of them.
 MOST_USED = {
     "pose": ("photos", "out", "marker", "board", "distance", "positions", "unit", "up", "turntable"),
-    "infer": ("scene", "masks", "out", "config", "scale", "unit", "up", "detect.weights", "detect.image_size",
-              "split_merged", "num_workers"),
+    "infer": ("scene", "again", "masks", "out", "config", "scale", "unit", "up", "views", "learn", "detect.weights",
+              "split_merged", "num_workers", "corrections"),
     "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
               "detect.weights"),
     "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "refine_poses"),
@@ -148,10 +148,10 @@ def build_parser(*, short: bool = False) -> ArgumentParser:
 
 
 def _list_names(words: Sequence[str]) -> list[str]:
-    """The options of the verb that was typed; without one, the verbs."""
+    """The options of the verb that was typed; without one, the verbs and the options that need none."""
     verb = next((word for word in words if not word.startswith("-")), "")
     if verb not in VERBS:
-        return list(VERBS)
+        return [*VERBS, "--help", "--version"]
     parser = ArgumentParser(exit_on_error=False)
     VERBS[verb][0].add_options(parser)
     return [name for action in parser._actions for name in action.option_strings if name.startswith("--")]

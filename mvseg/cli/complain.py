@@ -13,7 +13,8 @@ BAD_INPUT = 2
 # What jsonargparse says of a value of a wrong type: the option, the types that would be right, and the value.
 WRONG_TYPE = re.compile(r'Parser key "([^"]+)":? (.*?)(?:Got value|Given value): (.*)')
 EXPECTED = re.compile(r"Expected an? (?:<class '([\w.]+)'>|typing\.Literal\[([^\]]*)\])")
-# What argparse and jsonargparse say of names that nothing has.
+# What argparse and jsonargparse say of arguments that are missing, and of names that nothing has.
+MISSING = re.compile(r"the following arguments are required: (\w+)\.(.*)")
 UNKNOWN_VERB = re.compile(r"argument verb: invalid choice: '(.*?)'")
 UNKNOWN_OPTION = re.compile(r"[Uu]nrecognized arguments: --([\w.]+)|does not accept option '([\w.]+)'")
 TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
@@ -34,9 +35,13 @@ def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence
 
 def _suggest(message: str, known: Sequence[str]) -> str:
     """A sentence about a verb or an option that there is not, with the one that was perhaps meant."""
+    if missing := MISSING.match(message):
+        needs = missing[2].replace(f"{missing[1]}.", "")
+        return f"{missing[1]} needs {needs}: mvseg {missing[1]} --help says more"
     if unknown := UNKNOWN_VERB.match(message):
         near = get_close_matches(unknown[1], known, n=1)
-        expected = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+        verbs = ", ".join(name for name in known if not name.startswith("-"))
+        expected = f"did you mean {near[0]}?" if near else f"expected one of {verbs}"
         return f"there is no verb '{unknown[1]}', {expected}"
     if unknown := UNKNOWN_OPTION.search(message):
         near = get_close_matches(f"--{unknown[1] or unknown[2]}", known, n=1)

@@ -35,6 +35,7 @@ READERS: dict[str, Callable[[Path], Scene]] = {
 }
 
 
+@check_arguments
 @np.errstate(over="ignore", invalid="ignore")  # absurd numbers become infinite: no camera has such, and it is named
 def load_scene(folder: Path | str) -> Scene:
     """Load the cameras of a scene folder; photos are read later, when they are needed, and may be absent.

@@ -14,7 +14,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.errors import note_warnings
+from mvseg.errors import check_arguments, note_warnings
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import pack_known
 from mvseg.pipeline.finish import finish
@@ -24,6 +24,7 @@ from mvseg.results.result import Result
 from mvseg.system.running import running
 
 
+@check_arguments
 def run_scene(
     folder: Path | str,
     masks: Path | str | None = None,

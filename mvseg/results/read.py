@@ -21,7 +21,7 @@ from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
 from mvseg.crop import Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.errors import InputError, faults_of
+from mvseg.errors import InputError, check_arguments, faults_of
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.label_png import read_label_png, read_labels
@@ -124,6 +124,7 @@ def find_result(folder: Path) -> Path:
     return inside[0] if inside else folder
 
 
+@check_arguments
 def load_result(folder: Path | str) -> Result:
     """The result in a folder that mvseg wrote; neither the scene folder nor the photos are opened.
 
