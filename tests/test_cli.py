@@ -270,7 +270,7 @@ def test_the_papers_config_serves_both_verbs(plant: Path, tmp_path: Path) -> Non
 
 def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["match", str(plant), "--out", str(tmp_path / "out")]) == 0
-    assert "pictures: 100%" in capsys.readouterr().err
+    assert "writing pictures: 100%" in capsys.readouterr().err
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err == ""
 
@@ -281,7 +281,8 @@ def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     options = [*SMALL, "--detect.min_score", "0.05", "--out", str(tmp_path / "out"), *COARSE[:-2]]
     assert main(["infer", str(plant), *options]) == 0
     said = capsys.readouterr().err
-    stages = ["detection", "epipolar weights", "rays, 1 px", "search", "back-projection", "pictures", "masks"]
+    stages = ["detection", "comparing outlines", "matching, 1 px", "choosing ids", "voxels"]
+    stages += ["writing pictures", "writing masks"]
     assert [stage for stage in stages if f"{stage}:" not in said] == []
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "plant"]
 

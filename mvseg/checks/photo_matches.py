@@ -54,7 +54,7 @@ def match_photos(read: ReadPhoto, cameras: Cameras) -> list[PhotoMatches]:
     pairs = neighbours(cameras)
     wanted = sorted({view for pair in pairs for view in pair})
     features = {}
-    for view in progress_bar(wanted, name="features", unit="photo"):
+    for view in progress_bar(wanted, name="features of photos", unit="photo"):
         try:
             features[view] = find_features(read(view))
         except InputError:

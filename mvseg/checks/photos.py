@@ -48,7 +48,7 @@ class PhotoFacts:
 
 def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
     """One entry per view."""
-    views = progress_bar(range(len(photos.scene.views)), name="photos", unit="photo")
+    views = progress_bar(range(len(photos.scene.views)), name="checking photos", unit="photo")
     return [_read_facts(photos, view) for view in views]
 
 

@@ -92,7 +92,7 @@ def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
     unit_px = cameras.unit_px
     skip = is_coincident(cameras).tolist()
     pairs = [(i, j) for i, j in _chosen_pairs(num_views) if len(hulls[i]) and len(hulls[j]) and not skip[i][j]]
-    for i, j in progress_bar(pairs, name="poses", unit="pair"):
+    for i, j in progress_bar(pairs, name="checking cameras", unit="pair"):
         pencil = epipolar_pencil(cameras, i, j)
         first, second = _spans(pencil, 0, hulls[i]), _spans(pencil, 1, hulls[j])
         if len(first.ends) and len(second.ends):

@@ -184,7 +184,7 @@ def binned_pairs(
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
     pencils = epipolar_pencils(cameras, pairs)
     every_pair = zip(pairs, pencils, _pair_pitches(samples, pairs, pencils), strict=True)
-    for (i, j), pencil, pitches in progress_bar(every_pair, "epipolar weights", len(pairs), unit="pair"):
+    for (i, j), pencil, pitches in progress_bar(every_pair, "comparing outlines", len(pairs), unit="pair"):
         spans = find_spans(pencil, 0, samples[i]), find_spans(pencil, 1, samples[j])
         ends = tuple(torch.stack((part.low.min(), part.high.max())) for part in spans)
         bins = choose_bins(pitches, (ends[0], ends[1]))

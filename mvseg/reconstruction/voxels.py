@@ -128,7 +128,7 @@ def reconstruct_instances(
         sizes = enumerate(cameras.sizes.tolist())
         free = {view: regions.label_map(view, ones, size) == 0 for view, size in sizes}
     instances = instance_ids[instance_ids > 0].unique().tolist()
-    for instance in progress_bar(instances, name="back-projection", unit="instance"):
+    for instance in progress_bar(instances, name="voxels", unit="instance"):
         members = regions.select(instance_ids == instance)
         grid = back_project(members, cameras, config=config, free=free)
         if grid is not None and grid.occupied.any():

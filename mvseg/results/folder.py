@@ -143,7 +143,7 @@ def _write_images(result: Result, folder: Path) -> list[Picture]:
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     pictures, bars = [], fit_scale_bars(result)
     views = list(enumerate(scene.views))
-    for index, view in progress_bar(views, name="pictures", unit="view"):
+    for index, view in progress_bar(views, name="writing pictures", unit="view"):
         width, height = scene.cameras.sizes[index].tolist()
         write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
@@ -163,7 +163,7 @@ def _write_instances(result: Result, folder: Path) -> None:
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         image = {"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height}
         images.append(image | {"camera": _describe_camera(scene, index)})
-    shown = progress_bar(range(len(result.regions)), name="masks", unit="mask")
+    shown = progress_bar(range(len(result.regions)), name="writing masks", unit="mask")
     write_coco(folder / "instances.json", images, [_annotate(result, region) for region in shown])
 
 

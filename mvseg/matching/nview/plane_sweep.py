@@ -140,7 +140,7 @@ def sweep_dilated(
             _dilate(labels, of_view, start_px=grown_px, stop_px=dilation_px)
         grown_px = dilation_px
         label_maps = _LabelMaps(cameras, maps, [_label_box(labels) for labels in maps])
-        yield _sweep_views(label_maps, regions, xy, region=region, title=f"rays, {dilation_px} px")
+        yield _sweep_views(label_maps, regions, xy, region=region, title=f"matching, {dilation_px} px")
 
 
 def rays_per_region(num_views: int) -> int:

@@ -59,7 +59,7 @@ def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = 
     order = view_order(scores.graph)
     for _ in range(SEARCH.max_sweeps):
         ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
-        for view in progress_bar(order.tolist(), name="search", unit="view"):
+        for view in progress_bar(order.tolist(), name="choosing ids", unit="view"):
             movers = scores.graph.movers(view)
             if not movers.num:
                 continue

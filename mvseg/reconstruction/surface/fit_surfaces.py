@@ -95,7 +95,7 @@ def fit_surfaces(
         rough = start.coefficients.numpy() if start is not None and start.exists else None
         unfitted[instance] = _stack(members, cameras, frames, instance=instance), rough
     answers = map_in_order(partial(_fit_first, is_rough=is_rough), unfitted.values(), workers)
-    shown = progress_bar(answers, "surfaces", len(unfitted), unit="instance")
+    shown = progress_bar(answers, "fitting surfaces", len(unfitted), unit="instance")
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
         stacks[instance] = masks
         if fit is None:
