@@ -115,6 +115,7 @@ def test_options_become_config(photos: Path, tmp_path: Path, quick: list, capsys
         (["--positions", "nowhere.csv"], "No such file or directory), expected a table of positions"),
         (["--calibration", "nowhere.yaml"], "No such file or directory), expected camera_matrix"),
         (["--up", "0 0"], "up is '0 0'"),
+        (["--unit", "mm"], "unit is mm, and no length is known: expected --marker, --distance, ... with it"),
         (["--image_size", "null"], "image_size"),
     ],
 )

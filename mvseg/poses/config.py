@@ -73,9 +73,13 @@ class Known:
     positions: Path | None = None
     unit: str = ""
 
+    @property
+    def scales(self) -> list[str]:
+        """Names of what gives a scale."""
+        return [name for name in ("board", "marker", "distance", "positions") if getattr(self, name) is not None]
+
     def __post_init__(self) -> None:
-        given = [name for name in ("board", "marker", "distance", "positions") if getattr(self, name) is not None]
-        if len(given) > 1:
+        if len(given := self.scales) > 1:
             raise InputError(f"{' and '.join(given)} both give a scale, expected one of them")
         lengths = {"marker": self.marker, "distance": self.distance and self.distance[2]}
         for name, length in lengths.items():

@@ -56,8 +56,11 @@ def pose_photos(
 
     Raises:
         InputError: a photo or the video is broken, the video shows too little motion, too few photos register, what is
-            known does not fit them, or `out` holds something other than an earlier scene of these photos.
+            known does not fit them or names a unit of no length, or `out` holds something other than an earlier scene
+            of these photos.
     """
+    if known.unit and not known.scales:  # the lengths of the world would get it, and are arbitrary
+        raise InputError(f"unit is {known.unit}, and no length is known: expected --marker, --distance, ... with it")
     is_clip, file = is_video(photos), config.calibration
     output = Output("scene", of=(photos,), reads=tuple(path for path in (file, known.positions) if path is not None))
     check_place(out, output)
