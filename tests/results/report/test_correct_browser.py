@@ -425,6 +425,30 @@ def test_an_outline_is_an_answer(browser: sync_api.Browser, balls: Result, tmp_p
     person.close()
 
 
+def test_a_leaf_with_half_masks_is_outlined_in_both_photos(
+    browser: sync_api.Browser, balls: Result, tmp_path: Path
+) -> None:
+    doubtful = balls.matching.with_masks(replace(balls.masks, match_scores=torch.full((12,), 0.2)))
+    person = Person(browser, write_page(tmp_path / "report.html", replace(balls, matching=doubtful)))
+    person.page.keyboard.press("n")
+    places = person.page.evaluate("""(() => {
+      const { doubt } = modes.work;
+      doubt.kind = "half";
+      return [doubt.mask.at, doubt.otherMask.at];
+    })()""")
+    person.page.keyboard.press("o")
+    for pane, (x, y) in enumerate(places):
+        assert person.page.locator("#correct-ask h2").inner_text() == "Question 1 of 10"
+        person.drag(pane, [[x - 60, y - 60], [x + 60, y - 60], [x + 60, y + 60], [x - 60, y + 60], [x - 60, y - 50]])
+        person.page.keyboard.press("Enter")
+    assert person.page.locator("#correct-ask h2").inner_text() == "Question 2 of 10"
+    first, link, second, back = person.save(tmp_path)
+    assert [each["op"] for each in (first, link, second, back)] == ["outline", "same", "outline", "same"]
+    one, other = ([place[0] for place in each["at"]] for each in (link, back))
+    assert one == other[::-1] == [first["view"], second["view"]]
+    person.close()
+
+
 @pytest.fixture(scope="module")
 def offered(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the balls without the third, which is a candidate that was not chosen."""

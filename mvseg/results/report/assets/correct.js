@@ -325,7 +325,17 @@ class Work {
     if (points.length < 3) return this.discard("Nothing is left of it.");
     const wasAsked = this.doubt;
     this.add(this.drawnEdits(pane.view, points, leaf));
-    if (wasAsked?.kind !== "place") this.goOn(wasAsked); // there may be more leaves
+    const [first, second] = this.panes;
+    if (wasAsked?.kind === "half" && pane === first && second.view !== first.view) this.drawBeside(wasAsked);
+    else if (wasAsked?.kind !== "place") this.goOn(wasAsked); // there may be more leaves
+  }
+
+  // Two outlines say what all of a leaf is.
+  drawBeside(doubt) {
+    this.ask(doubt);
+    [, this.active] = this.panes;
+    this.take("outline");
+    this.say("Now all of it in the photo on the right: the others follow.");
   }
 
   // The outline as it was before it was fitted to the leaf.

@@ -11,7 +11,7 @@ function askAbout(doubt, { data }) {
     case "place": return "These large places have the colour of leaves, and no mask. Outline the leaves there, each in " +
       "two photos under one name: the others follow.";
     case "half": return `Leaf ${doubt.leaf} may have half masks in ${count(doubt.found, "photo")}, or a leaf beside it was ` +
-      "missed: the dashed lines show what looks like it. Outline all of it.";
+      "missed: the dashed lines show what looks like it. Outline all of it, in both photos: the others follow.";
     case "match": return other === null
       ? `Photo ${view}: no other photo shows ${leaf}. Is it a leaf?`
       : `Photo ${view}: is this ${leaf}?${beside}`;
