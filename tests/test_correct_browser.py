@@ -93,6 +93,12 @@ def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, f
     tab.page.get_by_label("delete edit 1").click()
     tab.wait_for("What you see follows from all edits.")
     assert ops(folder) == ["confirm"]
+    tab.page.evaluate("""(() => {
+      const { server } = modes.work;
+      server.tell({}, "The whole result is made.");
+      server.hear({ number: server.number, revision: server.base }); // no news, every 20 s
+    })()""")
+    tab.wait_for("The whole result is made.")
     with tab.page.expect_navigation():  # what edits changed is shown by a page loaded anew
         tab.page.locator("#mode-look").click()
     tab.page.wait_for_function("() => !document.querySelector('main').hidden && data.numMasks === 12")

@@ -16,6 +16,7 @@ class Server {
     this.base = work.data.correct.revision; // name of the edits that are saved, as far as this page knows
     this.own = new Set([this.base]); // names of all lists that it started from or saved
     this.learning = null; // {now: what is done, "" for nothing; isLearned, seconds}; null: nothing can learn
+    this.isLost = false; // it does not answer
     this.isStale = false; // another page has changed the edits: this one must not save over them
     work.edits.listen(() => {
       [this.unsaved, this.isComputing] = [true, true];
@@ -72,6 +73,7 @@ class Server {
         this.hear(state);
       } catch (error) {
         const advice = "start it again. What was not saved, save as corrections.json before you close this page.";
+        this.isLost = true;
         this.tell({ state: `mvseg correct does not answer (${error.message}): ${advice}` }, "");
         await new Promise((done) => setTimeout(done, AGAIN));
       }
@@ -85,6 +87,8 @@ class Server {
       this.tell({ state: who }, "");
       return;
     }
+    if (number === this.number && !this.isLost) return; // no news: what was said stays
+    this.isLost = false;
     const isFirst = this.number < 0;
     const goesOn = this.learning?.now && learning.now && !update;
     const isOld = revision !== this.base; // it was on its way while newer edits were saved
@@ -124,7 +128,7 @@ class Server {
     this.tell({ whole: "" }, "Making the whole result\u2026");
     try {
       const { said } = await this.ask("whole", { method: "POST" });
-      this.tell({ whole: "" }, said);
+      this.tell({ whole: "" }, `${said}. Its report.html has the traits.`);
     } catch (error) {
       this.tell({ whole: `The whole result was not made: ${error.message}` }, "");
     }
