@@ -31,7 +31,7 @@ from mvseg.results.result import NOTHING_LEARNED, Learned, Result
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files
-from mvseg.system.running import now_running, running
+from mvseg.system.running import now_running, running, timed
 
 
 def run_one_scene(
@@ -65,6 +65,7 @@ def run_one_scene(
     replaces = " (in place of an earlier result)" if place.is_dir() and any(place.iterdir()) else ""
     cache = place.with_name(f"{place.name}.detections")
     with ExitStack() as stack:
+        stack.enter_context(running(stages=_plan_stages(config, masks)))
         if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
             print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
         with running(num_workers=num_workers):
@@ -86,7 +87,8 @@ def run_one_scene(
                 print(f"mvseg: warning: {message}", file=sys.stderr)
         if learned.weights is not None:
             result = replace(result, learned=learned)
-        save_scene(result, scene, out, masks=masks, config=config, messages=messages, output=output)
+        with timed("write"):
+            save_scene(result, scene, out, masks=masks, config=config, messages=messages, output=output)
         if masks is None:
             delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
@@ -98,6 +100,14 @@ def run_one_scene(
         for word, sentence in lines.items():
             if sentence:
                 print(f"mvseg: {word}: {sentence}", file=sys.stderr)
+
+
+def _plan_stages(config: RunConfig, masks: Path | None) -> tuple[tuple[str, ...], ...]:
+    """What progress counts, see `Running.stages`."""
+    finds = (("detect",), ("match", "choose", "learn", "follow")) if masks is None else (("match", "follow"),)
+    shapes, traits = (("snap", "surfaces"),), (("voxels", "measure"),)
+    has_shapes = config.reconstruct is not None
+    return (*finds, *(shapes if has_shapes else ()), ("check",), *(traits if has_shapes else ()), ("write",))
 
 
 def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:

@@ -35,6 +35,8 @@ class Running:
         is_cancelled: asked before each stage, see `timed`.
         report: is told what is done, in words, as it goes on; None: nobody listens.
         told: names of the progress bars that have a line already, where there is no terminal.
+        stages: of the whole run, in order, each with its names in `timed`; (): they are not counted.
+        reached: indices of those that have begun, in order: a run may go back, the count never does.
     """
 
     progress: bool = False
@@ -44,6 +46,18 @@ class Running:
     is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
     report: Callable[[str], None] | None = field(default=None, compare=False)
     told: set[str] = field(default_factory=set, compare=False)
+    stages: tuple[tuple[str, ...], ...] = ()
+    reached: list[int] = field(default_factory=lambda: [0], compare=False)
+
+    def reach(self, name: str) -> None:
+        """A stage with this name begins."""
+        later = range(self.reached[-1] + 1, len(self.stages))
+        self.reached.extend(index for index in later if name in self.stages[index])
+
+    @property
+    def count(self) -> str:
+        """Which stage this is, "" where they are not counted."""
+        return f"stage {self.reached[-1] + 1} of {len(self.stages)}, " if self.stages else ""
 
 
 Args = ParamSpec("Args")
@@ -72,6 +86,7 @@ def running(
     keep: bool = False,
     is_cancelled: Callable[[], bool] | None = None,
     report: Callable[[str], None] | None = None,
+    stages: tuple[tuple[str, ...], ...] | None = None,
 ) -> Iterator[Running]:
     """Let all of mvseg that is called inside the block work so. A thread that is started there does not know of it.
 
@@ -83,6 +98,7 @@ def running(
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
         report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
             None: as outside.
+        stages: see `Running`; progress says which one it is at. None: as outside.
 
     Raises:
         InputError: fewer than one process.
@@ -95,7 +111,17 @@ def running(
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
         told = outside.told if outside.progress else set()
         report = outside.report if report is None else report
-        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, report=report, told=told)
+        planned, reached = (outside.stages, outside.reached) if stages is None else (stages, [0])
+        now = Running(
+            progress=is_shown,
+            workers=workers,
+            kept=kept,
+            is_cancelled=cancelled,
+            report=report,
+            told=told,
+            stages=planned,
+            reached=reached,
+        )
         stack.callback(_NOW.reset, _NOW.set(now))
         yield now
 
@@ -110,6 +136,7 @@ def timed(stage: str) -> Iterator[None]:
     now = now_running()
     if now.is_cancelled():
         raise Cancelled
+    now.reach(stage)
     begun = time.perf_counter()
     yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
@@ -150,11 +177,11 @@ def progress_bar(
     if now.report is not None:
         return _Reported(items, name, total, unit=unit, disable=True)
     if not now.progress or sys.stderr.isatty():
-        form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
+        form = f"{now.count}{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
         return tqdm(items, name, total, unit=unit, bar_format=form, leave=False, disable=not now.progress)
     is_told = name in now.told
     now.told.add(name)
-    form = f"{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
+    form = f"{now.count}{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
     return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
 
 

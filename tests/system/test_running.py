@@ -11,7 +11,7 @@ from contextvars import copy_context
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.system.running import Running, now_running, progress_bar, running
+from mvseg.system.running import Running, now_running, progress_bar, running, timed
 
 
 def test_it_holds_inside_only_and_nests() -> None:
@@ -69,6 +69,15 @@ def test_on_a_terminal_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "pictures: view 0 of 3, ? left" in terminal.getvalue()
     assert "\n" not in terminal.getvalue()
     assert terminal.getvalue().endswith(" \r")
+
+
+def test_stages_are_counted_and_the_count_never_goes_back(capsys: pytest.CaptureFixture[str]) -> None:
+    with running(progress=True, stages=(("detect",), ("match", "choose"), ("write",))), running(keep=True):
+        for stage in ("detect", "choose", "detect", "write"):
+            with timed(stage):
+                list(progress_bar(range(3), stage if stage != "detect" else f"look {len(now_running().seconds)}"))
+    lines = [line.split(":")[0] for line in capsys.readouterr().err.splitlines()]
+    assert lines == ["stage 1 of 3, look 0", "stage 2 of 3, choose", "stage 2 of 3, look 2", "stage 3 of 3, write"]
 
 
 def test_steps_are_reported_also_where_there_are_none_or_they_cannot_be_counted() -> None:
