@@ -537,3 +537,6 @@ def test_nothing_is_wider_than_the_screen(opened: Person) -> None:
     for width in (390, 800, 1280):
         opened.page.set_viewport_size({"width": width, "height": 800})
         assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
+        top = "(name) => document.getElementById(name).getBoundingClientRect().top"
+        question, photos = (opened.page.evaluate(top, name) for name in ("correct-ask", "panes"))
+        assert (question < photos - 10) == (width < 1000)  # on small screens, the question stands above the photos
