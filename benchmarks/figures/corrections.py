@@ -104,6 +104,8 @@ def main() -> None:
         page.locator("#mode-correct").click()
         person = Person(page)
         page.keyboard.press("n")
+        while page.evaluate("modes.work.doubt.kind") != "missing":  # the text is about such a question
+            page.keyboard.press("n")
         shoot(page, "ask")
         page.keyboard.press("c")
         for pane, view in enumerate(PAIR):
