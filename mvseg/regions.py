@@ -277,9 +277,15 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
 
     Returns:
         Regions ordered by view, then by number; `labels` holds the numbers.
+
+    Raises:
+        InputError: something else than such an array.
     """
     view_index, boxes, crops, labels, num_views = [], [], [], [], 0
     for view, label_map in enumerate(label_maps):
+        if not isinstance(label_map, np.ndarray) or label_map.ndim != 2 or label_map.dtype.kind not in "uib":
+            kind = f"{type(label_map).__name__} {getattr(label_map, 'shape', '')} {getattr(label_map, 'dtype', '')}"
+            raise InputError(f"view {view}: the label map is a {kind.strip()}, expected an integer array (H, W)")
         num_views = view + 1
         for number, (x1, y1, x2, y2) in sorted(label_boxes(label_map).items()):
             view_index.append(view)

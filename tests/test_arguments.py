@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,6 +17,7 @@ from mvseg import (
     fit_surfaces,
     load_scene,
     match_regions,
+    regions_from_label_maps,
     run_scene,
 )
 from mvseg.errors import InputError
@@ -35,6 +37,8 @@ from mvseg.scene import Scene
         (lambda r, s: epipolar_map(r, s.cameras, view=0, xy=[1, 2]), "xy is a list, expected Tensor"),
         (lambda r, s: match_regions(r, s.cameras, "nview"), r"config is a str, expected MatchConfig \(MatchConfig\("),
         (lambda r, s: run_scene(s), r"folder is a Scene, expected Path | str \(the place of a folder or a file\)"),
+        (lambda r, s: regions_from_label_maps([torch.zeros(4, 5)]), r"view 0: the label map is a Tensor"),
+        (lambda r, s: regions_from_label_maps([np.zeros((4, 5))]), r"a ndarray \(4, 5\) float64, expected an integer"),
         (lambda r, s: load_scene(None), "folder is a NoneType, expected Path | str"),
     ],
 )
