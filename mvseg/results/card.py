@@ -38,6 +38,8 @@ def make_card(result: Result, out: Path, *, scene: Path, masks: Path | None = No
 def _say_found(result: Result) -> str:
     num_photos, num_leaves = len(result.scene.views), result.matching.num_instances
     found = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
+    if result.traits is not None and (counted := int(result.traits.whole["number_of_leaves"].value)) != num_leaves:
+        found += f", {counted} of which count in the plant's traits"
     if result.learned.rounds:
         found += f", seen by a detector that learned this plant in {_count(result.learned.rounds, 'round', 'rounds')}"
     if result.traits is not None and (area := result.traits.whole["total_leaf_area"]).exists and num_leaves:

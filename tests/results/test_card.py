@@ -45,9 +45,10 @@ def test_doubtful_shapes_are_named_and_an_area_has_the_digits_that_are_known(
 ) -> None:
     good, bad = (SimpleNamespace(quality=SimpleNamespace(is_good=is_good)) for is_good in (True, False))
     area = SimpleNamespace(value=8484.2, sd=159.4, exists=True)
-    traits = SimpleNamespace(whole={"total_leaf_area": area}, unit="mm")
+    whole = {"total_leaf_area": area, "number_of_leaves": SimpleNamespace(value=9.0)}
+    traits = SimpleNamespace(whole=whole, unit="mm")
     shapes = Instances(surfaces={8: bad, 2: bad, 3: good}, traits=traits)  # type: ignore[dict-item,arg-type]
     matching = Matching(Masks.of(demo_regions, demo_truth), MatchReport("nview"))
     card = make_card(Result(demo_scene, matching, instances=shapes), OUT, scene=SCENE)
-    assert card.found == "12 leaves in 9 photos; total area 8,480 +- 160 mm^2"
+    assert card.found == "12 leaves in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2"
     assert card.doubt == "the shapes of leaves 2 and 8 are doubtful: the page says why"
