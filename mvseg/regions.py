@@ -319,8 +319,9 @@ def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:
 
 def _number_densely(band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The numbers that occur, ascending, and the band with 1, 2, ... in their place."""
-    if band.dtype in (np.uint8, np.uint16):  # looked up, not sorted
-        occurs = np.zeros(np.iinfo(band.dtype).max + 1, bool)
+    highest = int(band.max())
+    if band.dtype.kind in "iu" and band.min() >= 0 and highest <= np.iinfo(np.uint16).max:  # looked up, not sorted
+        occurs = np.zeros(highest + 1, bool)
         occurs[band] = True
         return np.flatnonzero(occurs), occurs.cumsum(dtype=np.int32)[band]
     numbers, dense = np.unique(band, return_inverse=True)
