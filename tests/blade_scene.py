@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
@@ -72,7 +73,12 @@ def ring_cameras(
 
 
 def blade_masks(blade: EllipticBlade, cameras: Cameras) -> list[np.ndarray]:
-    """V masks (H, W) bool: one exact ray through each pixel's centre."""
+    """V masks (H, W) bool: one exact ray through each pixel's centre. Each call has its own."""
+    return [mask.copy() for mask in _exact_masks(blade, cameras)]
+
+
+@cache
+def _exact_masks(blade: EllipticBlade, cameras: Cameras) -> list[np.ndarray]:
     v, u = np.mgrid[:SIZE, :SIZE] + 0.5
     px = np.stack([u, v, np.ones_like(u)], -1)
     matrices, centers = cameras.world_from_px.numpy(), cameras.centers.numpy()

@@ -6,7 +6,7 @@ moved as always, `module.to(device)`, and autocast does to convolutions and prod
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from typing import Any
@@ -17,7 +17,6 @@ import torchvision  # noqa: F401  # registers torch.ops.torchvision
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves, tree_map
 
 autocast = torch.autocast  # torch's own
 DEVICE = torch.device("meta")  # of those that torch knows everywhere; "cuda" looks for a driver
@@ -50,7 +49,8 @@ class OtherTensor(Tensor):
         if func in (Tensor.tolist, Tensor.__repr__):
             return func(args[0].inner)
         if func in (Tensor.__getitem__, Tensor.__setitem__):  # torch would make tensors without data of lists
-            args = (args[0], tree_map(_list_to_tensor, args[1], is_leaf=_is_list), *args[2:])
+            index = args[1] if isinstance(args[1], tuple) else (args[1],)
+            args = (args[0], tuple(map(_list_to_tensor, index)), *args[2:])
         with torch._C.DisableTorchFunctionSubclass():
             return func(*args, **(kwargs or {}))
 
@@ -65,23 +65,20 @@ class _Compute(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
-        tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
-        is_there = [isinstance(each, OtherTensor) for each in tensors]
-        checked = tree_leaves((args[0], args[2:])) if func in INDEXING else tensors
-        strangers = [
-            each for each in checked if isinstance(each, Tensor) and not isinstance(each, OtherTensor) and each.ndim
-        ]
-        if any(is_there) and strangers and func not in MOVES:
+        is_there = any(isinstance(each, OtherTensor) for each in _tensors((args, kwargs)))
+        checked = (args[0], args[2:]) if func in INDEXING else (args, kwargs)
+        strangers = (not isinstance(each, OtherTensor) and each.ndim for each in _tensors(checked))
+        if is_there and func not in MOVES and any(strangers):
             raise RuntimeError(f"{func}: expected all tensors on the same device, found {DEVICE} and cpu")
         target = kwargs.get("device")
-        plain_args, plain_kwargs = tree_map(_to_inner, (args, kwargs))
+        plain_args, plain_kwargs = _map(_to_inner, args), _map(_to_inner, kwargs)
         if target is not None:
             plain_kwargs["device"] = torch.device("cpu")
         answer = func(*plain_args, **plain_kwargs)
         if func.__name__.split(".")[0].endswith("_"):  # in place
             return args[0]
-        goes_there = any(is_there) if target is None else torch.device(target) == DEVICE
-        return tree_map(_to_other, answer) if goes_there else answer
+        goes_there = is_there if target is None else torch.device(target) == DEVICE
+        return _map(_to_other, answer) if goes_there else answer
 
 
 class _Create(TorchFunctionMode):
@@ -97,7 +94,7 @@ class _Create(TorchFunctionMode):
             return func(*args, **kwargs | {"device": None}).to(kwargs["device"])
         if self.lower is not None and func in LOWERED | SINGLE:
             cast = partial(_cast, dtype=self.lower if func in LOWERED else torch.float32)
-            args, kwargs = tree_map(cast, (args, kwargs))
+            args, kwargs = _map(cast, args), _map(cast, kwargs)
         return func(*args, **kwargs)
 
     @contextmanager
@@ -123,13 +120,27 @@ def other_device() -> Iterator[torch.device]:
         yield DEVICE
 
 
+def _tensors(values: Any) -> Iterator[Tensor]:
+    """All tensors in tuples, lists and dicts; torch's own walk over them takes longer than most operations."""
+    for value in values.values() if isinstance(values, dict) else values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, tuple | list | dict):
+            yield from _tensors(value)
+
+
+def _map(function: Callable[[Any], Any], values: Any) -> Any:
+    """The same tuples, lists and dicts of other values."""
+    if isinstance(values, tuple | list):
+        return type(values)([_map(function, each) for each in values])
+    if isinstance(values, dict):
+        return {name: _map(function, each) for name, each in values.items()}
+    return function(values)
+
+
 def _cast(value: Any, dtype: torch.dtype) -> Any:
     is_cast = isinstance(value, OtherTensor) and value.is_floating_point() and value.dtype != torch.float64
     return value.to(dtype) if is_cast else value
-
-
-def _is_list(value: Any) -> bool:
-    return isinstance(value, list)
 
 
 def _list_to_tensor(value: Any) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,19 +64,33 @@ def arc_positions(num_views: int, *, distance: float = 10.0, span: float = 200.0
 def render_balls(cameras: Cameras, centers: Tensor, radii: Tensor) -> list[np.ndarray]:
     """Label maps of the nearest ball along the ray through every pixel's centre."""
     label_maps = []
-    for view in range(len(cameras)):
-        width, height = cameras.sizes[view].tolist()
-        v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-        pixels = torch.stack((u, v, torch.ones_like(u)), -1).reshape(-1, 3).double()
-        rays = torch.nn.functional.normalize(pixels @ cameras.world_from_px[view].T, dim=1)
-        offset = centers.double() - cameras.centers[view]
-        along = rays @ offset.T
-        missed = offset.square().sum(1) - along.square() - radii.double().square()
-        depth = torch.where((missed < 0) & (along > 0), along - (-missed).clamp(min=0).sqrt(), math.inf)
-        nearest, ball = depth.min(1)
-        labels = torch.where(nearest.isfinite(), ball + 1, 0)
-        label_maps.append(labels.reshape(height, width).numpy())
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        labels, nearest = np.zeros((height, width), np.int64), np.full((height, width), np.inf)
+        offsets, world_from_px = (centers.double() - cameras.centers[view]).numpy(), cameras.world_from_px[view].numpy()
+        for ball, (offset, radius) in enumerate(zip(offsets, radii.double().tolist(), strict=True), start=1):
+            rows, columns = window = _window(cameras, view, centers[ball - 1].double(), radius)
+            v, u = np.mgrid[rows, columns] + 0.5
+            rays = np.stack((u, v, np.ones_like(u)), -1) @ world_from_px.T
+            along = rays @ offset / np.linalg.norm(rays, axis=-1)
+            missed = offset @ offset - along**2 - radius**2
+            depth = np.where((missed < 0) & (along > 0), along - np.sqrt(np.maximum(-missed, 0)), np.inf)
+            is_nearest = depth < nearest[window]
+            labels[window][is_nearest], nearest[window][is_nearest] = ball, depth[is_nearest]
+        label_maps.append(labels)
     return label_maps
+
+
+def _window(cameras: Cameras, view: int, center: Tensor, radius: float) -> tuple[slice, slice]:
+    """Rows and columns that hold all that a view shows of a ball."""
+    width, height = cameras.sizes[view].tolist()
+    cam = cameras.R[view] @ center + cameras.t[view]
+    depth = float(cam[2])
+    if depth <= radius:
+        return slice(0, height if depth > -radius else 0), slice(0, width)
+    x, y = (cameras.K[view] @ cam / depth)[:2].tolist()
+    reach = float(cameras.K[view, :2, :2].norm()) * radius / (depth - radius) * float(cam.norm()) / depth + 1
+    rows, columns = np.clip([[y - reach, y + reach], [x - reach, x + reach]], 0, [[height], [width]]).astype(int)
+    return slice(*rows), slice(*columns)
 
 
 def ball_scene(

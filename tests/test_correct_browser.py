@@ -16,7 +16,7 @@ from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
 from served_result import Lesson, SlowLook, serve, text_of
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,6 @@ def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, f
     tab.page.close()
 
 
-@pytest.mark.slow
 def test_two_tabs_never_save_over_each_other(browser: sync_api.Browser, served: CorrectionServer, folder: Path) -> None:
     one, other = Tab(browser, served), Tab(browser, served)
     other.wait_for("What you see follows from all edits.")
@@ -127,7 +126,6 @@ def test_two_tabs_never_save_over_each_other(browser: sync_api.Browser, served: 
         tab.page.close()
 
 
-@pytest.mark.slow
 def test_an_edit_that_could_not_be_saved_is_saved_later(
     browser: sync_api.Browser, served: CorrectionServer, folder: Path
 ) -> None:
@@ -147,7 +145,6 @@ def test_an_edit_that_could_not_be_saved_is_saved_later(
     tab.page.close()
 
 
-@pytest.mark.slow
 def test_a_file_that_another_program_has_changed_is_offered(
     browser: sync_api.Browser, served: CorrectionServer, folder: Path
 ) -> None:
@@ -166,7 +163,6 @@ def test_a_file_that_another_program_has_changed_is_offered(
     tab.page.close()
 
 
-@pytest.mark.slow
 def test_the_page_says_what_is_computed(
     browser: sync_api.Browser, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,7 +176,6 @@ def test_the_page_says_what_is_computed(
         tab.page.close()
 
 
-@pytest.mark.slow
 def test_a_detector_learns_while_a_person_edits(
     browser: sync_api.Browser, served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -204,7 +199,6 @@ def test_a_detector_learns_while_a_person_edits(
     tab.page.close()
 
 
-@pytest.mark.slow
 def test_fitting_to_the_leaf_is_undone_alone(browser: sync_api.Browser, served: CorrectionServer) -> None:
     tab = Tab(browser, served)
     points = "modes.work.draft.points"

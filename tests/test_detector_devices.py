@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -42,12 +41,6 @@ def photos() -> list[Tensor]:
     return list(torch.rand((3, 3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1)))
 
 
-@pytest.fixture
-def device() -> Iterator[torch.device]:
-    with other_device() as device:
-        yield device
-
-
 def there(module: Any, device: torch.device) -> Any:
     """A copy of a module, moved."""
     return copy.deepcopy(module).to(device)
@@ -65,66 +58,73 @@ def check(answer: dict[str, Tensor], expected: dict[str, Tensor], device: torch.
 
 @torch.no_grad()
 @pytest.mark.parametrize("arch", SMALL_ARCHITECTURES)
-def test_each_small_detector(arch: str, device: torch.device) -> None:
+def test_each_small_detector(arch: str) -> None:
     torch.manual_seed(0)
     model = build_detector(arch, 2, image_size=64).eval()
     photo = torch.rand((3, 48, 64), generator=torch.Generator().manual_seed(1))
     model.roi_heads.score_thresh, model.roi_heads.detections_per_img = 0.0, 5
-    check(run_heads(there(model, device), photo.to(device)), run_heads(model, photo), device)
+    expected = run_heads(model, photo)
+    with other_device() as device:
+        check(run_heads(there(model, device), photo.to(device)), expected, device)
 
 
 @torch.no_grad()
-def test_one_photo(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
-    moved, photo = there(model, device), photos[0]
-    found, masks = detect(moved, photo.to(device))
-    expected, pasted = detect(model, photo)
-    check(found | {"masks": torch.stack(list(masks))}, expected | {"masks": torch.stack(list(pasted))}, device)
+def test_one_photo(model: MaskRCNN, photos: list[Tensor]) -> None:
+    expected, pasted = detect(model, photos[0])
+    whole = expected | {"masks": torch.stack(list(pasted))}
+    with other_device() as device:
+        found, masks = detect(there(model, device), photos[0].to(device))
+        check(found | {"masks": torch.stack(list(masks))}, whole, device)
 
 
 @torch.no_grad()
-def test_nothing_found(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_nothing_found(model: MaskRCNN, photos: list[Tensor]) -> None:
     model.roi_heads.score_thresh = 1.0
-    found, masks = detect(there(model, device), photos[0].to(device))
-    assert {key: (value.device, value.dtype, tuple(value.shape)) for key, value in found.items()} == {
-        "boxes": (device, torch.float32, (0, 4)),
-        "labels": (device, torch.int64, (0,)),
-        "scores": (device, torch.float32, (0,)),
-    }
-    assert list(masks) == []
-    results = MultiViewMaskRCNN(there(model, device))([each.to(device) for each in photos], cameras=CAMERAS)
-    assert [result["instance_ids"].device for result in results] == [device] * 3
-    assert {len(value) for result in results for value in result.values()} == {0}
+    with other_device() as device:
+        found, masks = detect(there(model, device), photos[0].to(device))
+        assert {key: (value.device, value.dtype, tuple(value.shape)) for key, value in found.items()} == {
+            "boxes": (device, torch.float32, (0, 4)),
+            "labels": (device, torch.int64, (0,)),
+            "scores": (device, torch.float32, (0,)),
+        }
+        assert list(masks) == []
+        results = MultiViewMaskRCNN(there(model, device))([each.to(device) for each in photos], cameras=CAMERAS)
+        assert [result["instance_ids"].device for result in results] == [device] * 3
+        assert {len(value) for result in results for value in result.values()} == {0}
 
 
 @torch.no_grad()
-def test_double_detectors_answer_in_single(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_double_detectors_answer_in_single(model: MaskRCNN, photos: list[Tensor]) -> None:
     single = run_heads(model, photos[0])
-    check(run_heads(there(model.double(), device), photos[0].to(device).double()), single, device)
-    for dtype in (torch.float16, torch.float32, torch.float64):
-        raw = {"masks": single["masks"].to(dtype), "scores": single["scores"].to(dtype)}
-        answer = decide_masks({key: value.to(device) for key, value in raw.items()})
-        for key, expected in decide_masks(raw).items():
-            assert (answer[key].device, answer[key].dtype) == (device, dtype)
-            torch.testing.assert_close(answer[key].cpu(), expected)
+    with other_device() as device:
+        check(run_heads(there(model.double(), device), photos[0].to(device).double()), single, device)
+        for dtype in (torch.float16, torch.float32, torch.float64):
+            raw = {"masks": single["masks"].to(dtype), "scores": single["scores"].to(dtype)}
+            answer = decide_masks({key: value.to(device) for key, value in raw.items()})
+            for key, expected in decide_masks(raw).items():
+                assert (answer[key].device, answer[key].dtype) == (device, dtype)
+                torch.testing.assert_close(answer[key].cpu(), expected)
 
 
-def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor]) -> None:
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
-    moved, images = there(wrapped, device), [photo.to(device) for photo in photos]
-    expected = wrapped(photos, cameras=CAMERAS)
-    assert max(int(result["instance_ids"].max()) for result in expected) >= 1
-    for answer, result in zip(moved(images, cameras=CAMERAS.to(device)), expected, strict=True):
-        check(answer, result, device)
-    with torch.no_grad():
-        for answer, result in zip(moved(images), wrapped(photos), strict=True):
+    with other_device() as device:
+        moved, images = there(wrapped, device), [photo.to(device) for photo in photos]
+        expected = wrapped(photos, cameras=CAMERAS)  # by the same operations: ids in noise turn on the last bit
+        assert max(int(result["instance_ids"].max()) for result in expected) >= 1
+        for answer, result in zip(moved(images, cameras=CAMERAS.to(device)), expected, strict=True):
             check(answer, result, device)
+        with torch.no_grad():
+            for answer, result in zip(moved(images), wrapped(photos), strict=True):
+                check(answer, result, device)
 
 
-def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor]) -> None:
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
-    images = (photo.to(device) for photo in photos)
-    found = there(wrapped, device).find_regions(images, CAMERAS.to(device)).masks
-    expected = wrapped.find_regions(photos, CAMERAS).masks
+    with other_device() as device:
+        images = (photo.to(device) for photo in photos)
+        found = there(wrapped, device).find_regions(images, CAMERAS.to(device)).masks
+        expected = wrapped.find_regions(photos, CAMERAS).masks  # by the same operations
     assert (found.detection_scores.dtype, found.classes.dtype) == (torch.float32, torch.int64)
     for name in ("detection_scores", "classes", "match_scores"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name))
@@ -133,7 +133,7 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], dev
 
 
 def test_leaves_are_chosen_on_the_cpu(
-    model: MaskRCNN, photos: list[Tensor], device: torch.device, monkeypatch: pytest.MonkeyPatch
+    model: MaskRCNN, photos: list[Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
@@ -143,28 +143,29 @@ def test_leaves_are_chosen_on_the_cpu(
         return Leaves(proposals, {}, {}, ())
 
     monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
-    answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
-    for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
-        check(answer, expected, device)
+    results = wrapped(photos, cameras=CAMERAS)
+    with other_device() as device:
+        answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
+        for answer, expected in zip(answers, results, strict=True):
+            check(answer, expected, device)
 
 
-def test_autocast_there_reaches_the_backbone_and_no_boxes(
-    model: MaskRCNN, photos: list[Tensor], device: torch.device
-) -> None:
+def test_autocast_there_reaches_the_backbone_and_no_boxes(model: MaskRCNN, photos: list[Tensor]) -> None:
     """The cameras may have stayed on the CPU."""
-    wrapped, seen = there(MultiViewMaskRCNN(model, proposals_per_view=8), device), []
-    wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
-    wrapped.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
-    with torch.autocast(device.type, torch.bfloat16):
-        results = wrapped([photo.to(device) for photo in photos], cameras=CAMERAS)
-    assert seen == [torch.bfloat16, torch.float32] * 3
-    for result in results:
-        check(result, {key: value.cpu() for key, value in result.items()}, device)
-        assert not torch.equal(result["boxes"], result["boxes"].bfloat16().float())
+    with other_device() as device:
+        wrapped, seen = there(MultiViewMaskRCNN(model, proposals_per_view=8), device), []
+        wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
+        wrapped.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
+        with torch.autocast(device.type, torch.bfloat16):
+            results = wrapped([photo.to(device) for photo in photos], cameras=CAMERAS)
+        assert seen == [torch.bfloat16, torch.float32] * 3
+        for result in results:
+            check(result, {key: value.cpu() for key, value in result.items()}, device)
+            assert not torch.equal(result["boxes"], result["boxes"].bfloat16().float())
 
 
 @pytest.mark.parametrize("lower", [False, True])
-def test_losses_and_gradients(lower: bool, model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_losses_and_gradients(lower: bool, model: MaskRCNN, photos: list[Tensor]) -> None:
     """In half precision they are nearly the same, with the hook that training sets."""
     wrapped = MultiViewMaskRCNN(model.train())
     target = {
@@ -172,19 +173,20 @@ def test_losses_and_gradients(lower: bool, model: MaskRCNN, photos: list[Tensor]
         "labels": torch.tensor([1, 2]),
         "masks": torch.ones(2, HEIGHT, WIDTH, dtype=torch.uint8),
     }
-    moved = there(wrapped, device)
-    moved.rpn.head.register_forward_hook(leave_autocast)
     torch.manual_seed(5)
     expected = wrapped(photos[:1], [target])
     torch.manual_seed(5)
-    with torch.autocast(device.type, torch.bfloat16, enabled=lower):
-        losses = moved([photos[0].to(device)], [{key: value.to(device) for key, value in target.items()}])
-    assert losses.keys() == expected.keys()
-    for key, loss in losses.items():
-        assert loss.device == device
-        assert loss.isfinite()
-        torch.testing.assert_close(loss.float().cpu(), expected[key], rtol=0.2 if lower else 1e-5, atol=1e-5)
-    sum(losses.values()).backward()
-    gradient = moved.backbone[0].weight.grad
-    assert (gradient.device, gradient.dtype) == (device, torch.float32)
-    assert gradient.abs().sum() > 0
+    with other_device() as device:
+        moved = there(wrapped, device)
+        moved.rpn.head.register_forward_hook(leave_autocast)
+        with torch.autocast(device.type, torch.bfloat16, enabled=lower):
+            losses = moved([photos[0].to(device)], [{key: value.to(device) for key, value in target.items()}])
+        assert losses.keys() == expected.keys()
+        for key, loss in losses.items():
+            assert loss.device == device
+            assert loss.isfinite()
+            torch.testing.assert_close(loss.float().cpu(), expected[key], rtol=0.2 if lower else 1e-5, atol=1e-5)
+        sum(losses.values()).backward()
+        gradient = moved.backbone[0].weight.grad
+        assert (gradient.device, gradient.dtype) == (device, torch.float32)
+        assert gradient.abs().sum() > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -119,24 +119,19 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
 }  # fmt: skip
 
 
-@pytest.fixture
-def device() -> Iterator[torch.device]:
-    surfaces()  # fitted here
-    with other_device() as device:
-        yield device
-
-
 @pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 @pytest.mark.parametrize("name", STEPS)
-def test_the_answer_is_the_same_there(name: str, device: torch.device) -> None:
+def test_the_answer_is_the_same_there(name: str) -> None:
     step, stays = STEPS[name]
     expected = step(SCENE.regions, SCENE.cameras, IDS)
-    answer = step(SCENE.regions.to(device), SCENE.cameras.to(device), IDS.to(device))
-    if not isinstance(answer, torch.Tensor):
-        assert answer == pytest.approx(expected)
-        return
-    assert answer.device == (device if stays else CPU)
-    torch.testing.assert_close(answer.cpu(), expected)
+    surfaces()  # fitted here
+    with other_device() as device:
+        answer = step(SCENE.regions.to(device), SCENE.cameras.to(device), IDS.to(device))
+        if not isinstance(answer, torch.Tensor):
+            assert answer == pytest.approx(expected)
+            return
+        assert answer.device == (device if stays else CPU)
+        torch.testing.assert_close(answer.cpu(), expected)
 
 
 def test_every_public_name_is_looked_at() -> None:
@@ -144,6 +139,7 @@ def test_every_public_name_is_looked_at() -> None:
     assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
 
 
-def test_masks_keep_what_they_know(device: torch.device) -> None:
-    masks = masks_of(SCENE.regions.to(device), IDS.to(device))
-    assert replace(masks).to("cpu").instance_ids.tolist() == IDS.tolist()
+def test_masks_keep_what_they_know() -> None:
+    with other_device() as device:
+        masks = masks_of(SCENE.regions.to(device), IDS.to(device))
+        assert replace(masks).to("cpu").instance_ids.tolist() == IDS.tolist()

@@ -11,6 +11,7 @@ import socket
 import sys
 import traceback
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -112,14 +113,18 @@ def make_config(folder: Path, output: Path, **changes: Any) -> TrainConfig:
 def write_finished_run(folder: Path) -> Path:
     """The files of a finished training run of the smaller architecture, three categories, without the training."""
     folder.mkdir()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        model = build_detector("mobilenet_v3_large_fpn", 4)
-    description = Description("mobilenet_v3_large_fpn", ("a", "b", "c"), 96)
-    (folder / "model.safetensors").write_bytes(encode_weights(model.state_dict(), description))
+    (folder / "model.safetensors").write_bytes(_finished_weights())
     (folder / "metrics.json").write_text('{"best": {"epoch": 3, "mask_AP": 0.5, "mask_AP50": 0.75}}')
     (folder / "config.yaml").write_text("arch: mobilenet_v3_large_fpn\n")
     return folder
+
+
+@cache
+def _finished_weights() -> bytes:
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = build_detector("mobilenet_v3_large_fpn", 4)
+    return encode_weights(model.state_dict(), Description("mobilenet_v3_large_fpn", ("a", "b", "c"), 96))
 
 
 def parse_config(path: Path) -> TrainConfig:

@@ -34,6 +34,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield cluster
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_loses_what_it_had_and_the_rest_goes_on(cluster: Any, tmp_path: Path) -> None:
     begun: list[int] = []
     words = ["a", "kill", "b", "raise", "c", "d"]
@@ -51,6 +52,7 @@ def test_a_worker_that_dies_loses_what_it_had_and_the_rest_goes_on(cluster: Any,
     assert begun == [0, 1, 2, 3, 4, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
 def test_workers_end_on_sigterm_as_dask_has_it(cluster: Any) -> None:
     """Loading pycolmap would set a handler that prints a C++ trace, and may hang."""
@@ -64,6 +66,7 @@ def test_workers_end_on_sigterm_as_dask_has_it(cluster: Any) -> None:
     assert {is_handled for _, is_handled in after.values()} == {is_handled for _, is_handled in before.values()}
 
 
+@pytest.mark.slow
 def test_items_are_given_to_all_workers_at_once_and_taken_back(cluster: Any, tmp_path: Path) -> None:
     with connect(cluster.scheduler_address) as client:
         answers = dict(run_on_dask(do_as_told, dict(enumerate("abcdef")), int, client=client))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from mvseg.formats import markers
 from mvseg.formats.board import Family
 from mvseg.formats.markers import Seen, find_scene_markers
 from mvseg.formats.photos import Photos
@@ -15,7 +16,7 @@ from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, write_structure
 from mvseg.scene import Cameras, Scene
-from room_scene import room_cameras, write_room
+from room_scene import BOARD, room_cameras, write_room
 from watched_stages import watch_stages
 
 
@@ -41,5 +42,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
     with pytest.MonkeyPatch.context() as patch:
         steps = watch_stages(patch)
         structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
-    scene = write_structure(structure, folder)
-    return MappedRoom(folder, tuple(steps), truth, files, structure, scene, find_scene_markers(Photos(scene)))
+        scene = write_structure(structure, folder)
+        patch.setattr(markers, "FAMILIES", ("4X4_1000", BOARD.family))  # to look for all of them takes seconds
+        seen = find_scene_markers(Photos(scene))
+    return MappedRoom(folder, tuple(steps), truth, files, structure, scene, seen)

@@ -407,9 +407,13 @@ def test_scale_bars_are_as_long_as_the_plant_shows_them(result: Result) -> None:
 
 class TestWholeOrNotAtAll:
     @pytest.mark.parametrize(
-        "error", [OSError(28, "No space left on device"), RuntimeError("bug"), KeyboardInterrupt()]
+        ("writer", "error"),
+        [
+            *((writer, OSError(28, "No space left on device")) for writer in WRITERS),
+            ("write_ply", RuntimeError("bug")),
+            ("draw_picture", KeyboardInterrupt()),
+        ],
     )
-    @pytest.mark.parametrize("writer", WRITERS)
     def test_a_failure_half_way_leaves_nothing(
         self, writer: str, error: BaseException, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -40,6 +40,14 @@ def leaves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """8 photos, for runs of which only the files matter."""
+    folder = tmp_path_factory.mktemp("few")
+    write_photos(folder, 8)
+    return folder
+
+
+@pytest.fixture(scope="module")
 def finished(leaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The output of a run that nothing disturbed."""
     output = tmp_path_factory.mktemp("finished")
@@ -97,16 +105,16 @@ def test_the_export_is_the_average_of_the_best_epoch(leaves: Path, finished: Pat
     assert any(not torch.equal(exported[key], value) for key, value in checkpoint["model"].items())
 
 
-def test_a_run_leaves_the_callers_generator_alone(leaves: Path, tmp_path: Path) -> None:
+def test_a_run_leaves_the_callers_generator_alone(few: Path, tmp_path: Path) -> None:
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    train(make_config(leaves, tmp_path, epochs=1, batch_size=24, hold_out_every=0), build_tiny())
+    train(make_config(few, tmp_path, epochs=1, hold_out_every=0), build_tiny())
     assert torch.equal(torch.rand(3), expected)
 
 
-def test_without_validation_the_last_epoch_is_exported(leaves: Path, tmp_path: Path) -> None:
-    config = make_config(leaves, tmp_path, hold_out_every=0, batch_size=10, ema_decay=0.0, optimizer="sgd")
+def test_without_validation_the_last_epoch_is_exported(few: Path, tmp_path: Path) -> None:
+    config = make_config(few, tmp_path, hold_out_every=0, ema_decay=0.0, optimizer="sgd")
     train(config, build_tiny())
     checkpoint = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     exported = load_weights(tmp_path / "model.safetensors")
@@ -120,7 +128,7 @@ def test_best_epoch() -> None:
 
 
 def test_bf16_on_the_cpu_is_close_to_fp32(leaves: Path, tmp_path: Path, finished: Path) -> None:
-    train(make_config(leaves, tmp_path, precision="bf16"), build_tiny())
+    train(make_config(leaves, tmp_path, precision="bf16", epochs=1), build_tiny())
     ours, exact = read_log(tmp_path)[0]["loss"], read_log(finished)[0]["loss"]
     assert ours != exact
     assert ours == pytest.approx(exact, rel=0.05)
@@ -170,8 +178,8 @@ def test_a_killed_run_ends_with_the_same_bits(leaves: Path, tmp_path: Path, fini
     assert all(torch.equal(exported[key], value) for key, value in load_weights(finished / "model.safetensors").items())
 
 
-def test_resuming_a_finished_run_changes_nothing(leaves: Path, tmp_path: Path) -> None:
-    config = make_config(leaves, tmp_path, epochs=1, batch_size=24, images_per_forward=12)
+def test_resuming_a_finished_run_changes_nothing(few: Path, tmp_path: Path) -> None:
+    config = make_config(few, tmp_path, epochs=1)
     train(config, build_tiny())
     before = (tmp_path / "checkpoint.pt").read_bytes()
     train(dataclasses.replace(config, resume=True), build_tiny())
@@ -215,19 +223,19 @@ def test_another_run_is_not_overwritten(leaves: Path, finished: Path) -> None:
         train(make_config(leaves, finished, resume=True, lr=0.5), build_tiny())
 
 
-def test_a_finished_run_can_be_prolonged(leaves: Path, tmp_path: Path) -> None:
+def test_a_finished_run_can_be_prolonged(few: Path, tmp_path: Path) -> None:
     """And then it is the run that had the longer end from the start, where the learning rate is constant."""
-    config = {"schedule": "constant", "hold_out_every": 0, "batch_size": 8}
-    train(make_config(leaves, tmp_path / "once", epochs=2, **config), build_tiny())
-    train(make_config(leaves, tmp_path / "twice", epochs=1, **config), build_tiny())
+    config = {"schedule": "constant", "hold_out_every": 0}
+    train(make_config(few, tmp_path / "once", epochs=2, **config), build_tiny())
+    train(make_config(few, tmp_path / "twice", epochs=1, **config), build_tiny())
     (tmp_path / "twice" / "run.json").unlink()  # earlier versions wrote none
-    train(make_config(leaves, tmp_path / "twice", epochs=2, resume=True, **config), build_tiny())
+    train(make_config(few, tmp_path / "twice", epochs=2, resume=True, **config), build_tiny())
     assert len(read_metrics(tmp_path / "twice")["epochs"]) == 2
     once, twice = (load_weights(tmp_path / name / "model.safetensors") for name in ("once", "twice"))
     for key, value in once.items():
         torch.testing.assert_close(twice[key], value, rtol=0, atol=0)
     with pytest.raises(InputError, match=r"made with another epochs \(2, now 1\)"):
-        train(make_config(leaves, tmp_path / "twice", epochs=1, resume=True, **config), build_tiny())
+        train(make_config(few, tmp_path / "twice", epochs=1, resume=True, **config), build_tiny())
 
 
 def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(leaves: Path, tmp_path: Path) -> None:
@@ -254,10 +262,10 @@ def test_a_signal_to_all_processes_is_left_to_the_run(leaves: Path, tmp_path: Pa
                 os.kill(chunks._workers[0].pid, signal.SIGTERM)
 
 
-def test_what_a_killed_run_left_half_written_is_deleted(leaves: Path, tmp_path: Path) -> None:
+def test_what_a_killed_run_left_half_written_is_deleted(few: Path, tmp_path: Path) -> None:
     """Also by a run that was killed while it wrote its first file."""
     (tmp_path / ".config.yaml.77.partial").write_text("")
-    train(make_config(leaves, tmp_path, resume=True, epochs=1, batch_size=24), build_tiny())
+    train(make_config(few, tmp_path, resume=True, epochs=1), build_tiny())
     assert (tmp_path / "model.safetensors").is_file()
     assert not any(is_partial(path) for path in tmp_path.iterdir())
 

@@ -13,7 +13,7 @@ from blade_scene import as_regions
 from known_leaves import flat_leaf
 from matched import matched
 from mvseg.demo import demo_scene
-from mvseg.formats.photos import Photos
+from mvseg.formats.photos import ReadPhoto, read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
@@ -27,6 +27,11 @@ def plant() -> tuple[Scene, Regions]:
     """The shipped plant and its true masks; their labels are the leaves."""
     scene = load_scene(demo_scene())
     return scene, load_masks(scene, demo_scene() / "truth")
+
+
+@pytest.fixture(scope="module")
+def photos(plant: tuple[Scene, Regions]) -> ReadPhoto:
+    return [read_photo(plant[0], view) for view in range(9)].__getitem__
 
 
 def drawn(truth: Regions, leaf: int, views: tuple[int, ...], *, missed: tuple[int, ...] = ()) -> Masks:
@@ -46,11 +51,11 @@ def mask_of(regions: Regions, is_leaf: Tensor, view: int, size: tuple[int, int])
     [(8, (4, 7), ()), (10, (4, 8), (1, 5, 9, 12)), (3, (5, 8), ())],  # of the outlines alone: 0.21, 0.35, 0.34
 )
 def test_the_other_views_show_it(
-    plant: tuple[Scene, Regions], leaf: int, views: tuple[int, ...], missed: tuple[int, ...]
+    plant: tuple[Scene, Regions], photos: ReadPhoto, leaf: int, views: tuple[int, ...], missed: tuple[int, ...]
 ) -> None:
     scene, truth = plant
     before = drawn(truth, leaf, views, missed=missed)
-    after, surfaces = follow_drawn(before, cameras=scene.cameras, photos=Photos(scene))
+    after, surfaces = follow_drawn(before, cameras=scene.cameras, photos=photos)
     assert list(surfaces) == [leaf]
     for name in ("instance_ids", "origin", "view_index"):
         assert torch.equal(getattr(after, name)[: len(before)], getattr(before, name))
@@ -68,30 +73,30 @@ def test_the_other_views_show_it(
     assert np.median(ious) > 0.85
 
 
-def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(plant: tuple[Scene, Regions]) -> None:
+def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(plant: tuple[Scene, Regions], photos: ReadPhoto) -> None:
     scene, truth = plant
     masks = drawn(truth, 10, (4, 8))
     lost = truth.select((truth.labels == 10) & (truth.view_index == 2))
     both = Masks.concatenate((masks, Masks.of(lost)))
-    after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
+    after, _ = follow_drawn(both, cameras=scene.cameras, photos=photos)
     assert after.instance_ids[len(masks)] == 10
     assert after.origin[len(masks)] == Origin.GIVEN
     assert 2 not in after.view_index[len(both) :].tolist()
 
 
-def test_nothing_is_looked_for_without_need(plant: tuple[Scene, Regions]) -> None:
+def test_nothing_is_looked_for_without_need(plant: tuple[Scene, Regions], photos: ReadPhoto) -> None:
     scene, truth = plant
     for masks in (
         drawn(truth, 10, (4,)),
         drawn(truth, 10, tuple(range(9))),
         drawn(truth, 10, (4, 8)).select(torch.zeros(0, dtype=torch.int64)),
     ):
-        after, surfaces = follow_drawn(masks, cameras=scene.cameras, photos=Photos(scene))
+        after, surfaces = follow_drawn(masks, cameras=scene.cameras, photos=photos)
         assert len(after) == len(masks)
         assert surfaces == {}
 
 
-def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]) -> None:
+def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions], photos: ReadPhoto) -> None:
     """What contradicts itself has no credible surface, or shows nothing openly: no mask of others is touched."""
     scene, truth = plant
     masks = drawn(truth, 10, (4,))
@@ -99,7 +104,7 @@ def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]
     wrong = Masks.of(other, torch.tensor([10]), origin=Origin.CORRECTED)
     both = Masks.concatenate((masks.select(~((masks.view_index == 8) & (masks.instance_ids == 3))), wrong))
     both = replace(both, instance_ids=torch.where(torch.arange(len(both)) == len(both) - 1, 10, both.instance_ids))
-    after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
+    after, _ = follow_drawn(both, cameras=scene.cameras, photos=photos)
     for name in ("instance_ids", "origin", "match_scores"):
         assert torch.equal(getattr(after, name)[: len(both)], getattr(both, name))
 
