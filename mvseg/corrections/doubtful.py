@@ -157,8 +157,8 @@ def _usual_area(masks: Masks) -> float:
 
 
 def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> list[Doubt]:
-    """Large places without masks, all in one question; and leaves beside whose masks there are such places in several
-    views, a question each."""
+    """Large places without masks, all in one question, if two views have such; and leaves beside whose masks there are
+    such places in several views, a question each."""
     ids, areas, drawn = masks.instance_ids.tolist(), masks.regions.areas.tolist(), masks.is_corrected.tolist()
     places, halves = [], defaultdict[int, dict[int, Unmasked]](dict)
     for part in sorted(parts, key=lambda one: (-one.area, one.view)):
@@ -177,7 +177,7 @@ def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) ->
             Doubt("half", DOUBTS.unmasked, largest.view, instance, region=largest.row, found=len(views),
                   expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
         )  # fmt: skip
-    if places:
+    if len({part.view for part in places}) > 1:  # two outlines are a leaf
         outlines = tuple((part.view, part.outline) for part in places[: DOUBTS.most_places])
         found.append(Doubt("place", DOUBTS.unmasked, outlines[0][0], -1, outlines=outlines))
     return found

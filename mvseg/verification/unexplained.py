@@ -9,8 +9,8 @@ from mvseg.masks import Masks
 from mvseg.verification.leaf_color import has_leaf_color, thin_views
 from mvseg.verification.numbers import COLORS, EVIDENCE
 
-HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct); or give masks (--masks)"
-LEARN = f"let the views teach the detector (--learn auto); then {HELP}"
+HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct)"
+LEARN = "let the views teach the detector (--learn 2)"
 
 
 @dataclass(frozen=True)

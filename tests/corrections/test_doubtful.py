@@ -193,6 +193,9 @@ def test_large_places_that_look_like_leaves_come_first() -> None:
         assert (TRUE[view][drawn] == 2).mean() > 0.9
     sizes = [cv2.contourArea(outline.astype(np.float32)) for _, outline in first.outlines]
     assert sizes == sorted(sizes, reverse=True)
+    photos[1:] = [np.where(photo == GREEN, BROWN, photo) for photo in photos[1:]]
+    found = list_doubts(masks, None, cameras=CAMERAS, photos=[p.astype(np.uint8) for p in photos].__getitem__)
+    assert "place" not in {each.kind for each in found}  # nothing that one photo shows becomes a leaf
 
 
 def halved(views: tuple[int, ...]) -> Masks:

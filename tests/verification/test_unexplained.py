@@ -64,6 +64,9 @@ def test_what_is_missing_is_said_once() -> None:
     assert said is not None
     assert said.why.startswith(f"{share:.0%} of what has the colour")
     assert "mvseg correct" in said.helps
+    untaught = find_missing(found((2,)), photo, sure_score=0.3, may_learn=False)
+    assert untaught is not None
+    assert "--learn 2" in untaught.helps
     unknown = find_missing(found((1, 2, 3), score=0.2), photo, sure_score=0.3)
     assert unknown is not None
     assert "does not know this species" in unknown.why
