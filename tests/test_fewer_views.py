@@ -19,6 +19,7 @@ from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
+SHAPES = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
 COARSE = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_budget=500))
 
 
@@ -96,7 +97,7 @@ def test_a_result_says_which_views_it_shows_and_is_made_again_with_them(
     plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    plain = ["--out", str(out), "--quiet", "--report", "false", "--reconstruct.shape", "voxels"]
+    plain = ["--out", str(out), "--quiet", "--report", "false", *SHAPES]
     assert main(["infer", str(plant), "--masks", "masks", "--views", "5", *plain]) == 0
     said = capsys.readouterr()
     assert "mvseg: 5 of 9 views are taken, evenly spread\n" in said.err
@@ -117,7 +118,7 @@ def test_a_result_is_corrected_in_its_own_views_and_in_those_that_were_corrected
     plant: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    words = ["--masks", "masks", "--views", "4", "--out", str(out), "--quiet", "--reconstruct.shape", "voxels"]
+    words = ["--masks", "masks", "--views", "4", "--out", str(out), "--quiet", "--report", "false", *SHAPES]
     assert main(["infer", str(plant), *words]) == 0
     few = taken(plant, 4)
     with pytest.warns(InputWarning, match="15 of 27 masks are left out"):

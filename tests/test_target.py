@@ -41,6 +41,14 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def two_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first two alone."""
+    folder = tmp_path_factory.mktemp("target") / "page"
+    write_photos(folder, small_cameras(2), px_per_mm=4, seed=4, printed=0.97, lens=(0.03, -0.01))
+    return folder
+
+
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     (line,) = capsys.readouterr().err.splitlines()
     return line.removeprefix("mvseg: error: ")
@@ -163,9 +171,11 @@ def test_a_page_printed_at_97_percent_is_noticed(
         assert shape["num_views"] == shape["num_masks"] >= 4
 
 
-def test_a_photo_without_shapes_is_named(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_photo_without_shapes_is_named(
+    two_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Printed without colour: its tags are found, its shapes are not."""
-    folder = Path(shutil.copytree(photos, tmp_path / "page"))
+    folder = Path(shutil.copytree(two_photos, tmp_path / "page"))
     path = folder / "images" / "01.jpg"
     grey = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2GRAY)
     cv2.imwrite(str(path), grey)
@@ -180,10 +190,10 @@ def test_photos_of_something_else(capsys: pytest.CaptureFixture[str]) -> None:
     assert complaint(capsys) == f"{demo_scene() / 'cameras.json'}: {said}"
 
 
-def test_cameras_without_a_unit(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = json.loads((photos / "cameras.json").read_text())
+def test_cameras_without_a_unit(two_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = json.loads((two_photos / "cameras.json").read_text())
     (tmp_path / "cameras.json").write_text(json.dumps(rig | {"unit": ""}))
-    (tmp_path / "images").symlink_to(photos / "images")
+    (tmp_path / "images").symlink_to(two_photos / "images")
     assert main(["check", str(tmp_path), "--target", "--quiet"]) == 2
     said = "they say no unit, expected mm, cm or m, as mvseg pose --unit mm states it"
     assert complaint(capsys) == f"{tmp_path / 'cameras.json'}: {said}"
@@ -202,9 +212,9 @@ def test_options_that_do_not_fit(words: list[str], message: str, capsys: pytest.
     assert complaint(capsys).startswith(message)
 
 
-def test_tags_are_where_the_page_says(photos: Path) -> None:
+def test_tags_are_where_the_page_says(two_photos: Path) -> None:
     """Corners in the order of `find_markers`, no half pixel off."""
-    scene = load_scene(photos)
+    scene = load_scene(two_photos)
     found = find_markers(read_grey(Photos(scene), 0), FAMILY)
     assert found.keys() <= tag_corners().keys()
     misses = []

@@ -18,8 +18,7 @@ def count_norms(model: nn.Module) -> int:
 
 
 @pytest.mark.parametrize("arch", ["efficientnet_lite0", "mobilenet_v3_large_fpn", "resnet18_fpn"])
-@pytest.mark.parametrize("size", [(64, 96), (97, 51)])
-def test_features_stay(arch: str, size: tuple[int, int]) -> None:
+def test_features_stay(arch: str) -> None:
     torch.manual_seed(0)
     model = build_bare(arch, 2)
     for name, value in model.state_dict().items():
@@ -29,11 +28,12 @@ def test_features_stay(arch: str, size: tuple[int, int]) -> None:
             value.uniform_(0.5, 1.5)
     model = replace_batch_norm(model, frozen=True).eval()
     folded = fold_norms(copy.deepcopy(model))
-    photos = torch.rand(1, 3, *size)
-    with torch.no_grad():
-        for level, features in model.backbone(photos).items():
-            same = folded.backbone(photos)[level]
-            torch.testing.assert_close(same, features, rtol=1e-3, atol=1e-3 * float(features.abs().max()))
+    for size in ((64, 96), (97, 51)):
+        photos = torch.rand(1, 3, *size)
+        with torch.no_grad():
+            expected, found = model.backbone(photos), folded.backbone(photos)
+        for level, features in expected.items():
+            torch.testing.assert_close(found[level], features, rtol=1e-3, atol=1e-3 * float(features.abs().max()))
     assert count_norms(folded) < count_norms(model)
     assert count_norms(folded) == 0 or arch == "resnet18_fpn"  # whose blocks are no sequences
 

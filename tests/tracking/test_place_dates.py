@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import combinations
 from unittest.mock import patch
 
@@ -19,6 +20,7 @@ HALF_TURN = Rotation.from_euler("z", 180, degrees=True).as_matrix()
 TURNS = (0.0, 80.0, 200.0, 200.0)
 
 
+@cache
 def look_at(turns: tuple[float, ...]) -> dict[tuple[int, int], Poses]:
     leaves = [leaves_of(see(grown(BLADES, 1 + 0.05 * n), n, turn=turn)[0]) for n, turn in enumerate(turns)]
     return {(a, b): list_poses(Pair.of(leaves[a], leaves[b], days=b - a, knows_up=True))
