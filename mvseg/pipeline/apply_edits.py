@@ -15,7 +15,6 @@ from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.matching.match import describe_disagreement, match_masks
-from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
@@ -41,18 +40,12 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
         seen = seen_ids(corrected.masks, before) if opened.is_chosen else torch.full_like(corrected.last_edits, -1)
         seen = seen.where(torch.isin(seen, leaves_as_seen(corrected, seen, before)), -1)
     with timed("match"):
-        matching, seen = _match_anew(known, corrected, seen)
-    masks, corrected = apply_everywhere(corrected, matching.masks)
+        matched, seen = _match_anew(known, corrected, seen)
+    masks, corrected = apply_everywhere(corrected, matched.masks)
     if len(shown) and not len(masks):
         warn(NOTHING_LEFT)
     edited = replace(
-        known,
-        matching=matching,
-        instances=Instances(),
-        left=(),
-        edits=corrected.fates,
-        refused=corrected.refused,
-        disagreement=describe_disagreement(matching, opened.names),
+        matched, instances=Instances(), left=(), edits=corrected.fates, refused=corrected.refused
     ).with_masks(masks)
     if opened.is_chosen or config.reconstruct is not None:
         with timed("follow"):
@@ -78,13 +71,15 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
     return edited.with_leaves(leaves)
 
 
-def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Matching, Tensor]:
-    """The masks matched anew, but for those of leaves that stay as they were `seen` (D,): these keep their ids. Where
-    the views choose, and a person speaks of such leaves only, nothing else is needed. And the leaves that stay."""
+def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Known, Tensor]:
+    """The same with the edited masks, matched anew, but for those of leaves that stay as they were `seen` (D,): these
+    keep their ids. Where the views choose, and a person speaks of such leaves only, nothing is matched. And the leaves
+    that stay: those that other masks join do not."""
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
     if known.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
-        return known.matching.with_masks(replace(masks, instance_ids=seen).close_gaps()), seen
+        ids_only = replace(masks, instance_ids=seen).close_gaps()
+        return replace(known, matching=known.matching.with_masks(ids_only)), seen
     is_known = 2 * int(masks.is_corrected.sum()) <= len(known.masks)  # else his masks tell it better
     matching = match_masks(
         masks,
@@ -96,7 +91,9 @@ def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Match
     matched = matching.masks.to("cpu")
     seen = leave_joined(seen, matched.instance_ids, is_held)
     ids = torch.where(seen > 0, seen + matched.num_instances, matched.instance_ids)
-    return matching.with_masks(replace(matched, instance_ids=ids).close_gaps()), seen
+    said = describe_disagreement(matching, known.opened.names)
+    matching = matching.with_masks(replace(matched, instance_ids=ids).close_gaps())
+    return replace(known, matching=matching, disagreement=said), seen
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:

@@ -126,7 +126,7 @@ def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
 
 
 def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
-    """The masks, and after them the others that show something else than these: see `SHARED`; by view."""
+    """The masks, and after them the others that show something else than these (`EVIDENCE.shared`); by view."""
     both = Masks.concatenate((masks, others.with_merged(())))
     is_added = torch.ones(len(both), dtype=torch.bool)
     for each in draw_views(both.regions, (), cameras.to("cpu")):

@@ -138,6 +138,8 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
     assert after.masks.match_scores[named].tolist() == [1, 1, 1]
     certain = {leaf for leaf, chance in after.instances.probabilities.items() if chance == 1}
     assert certain == set(after.masks.instance_ids[named].tolist())
+    odd = replace(find_in_photos(open_photos(SCENE)), disagreement="the views hardly agree")
+    assert apply_edits(odd, Corrections(said)).disagreement == odd.disagreement
     less = run(*said, Reject(view="v4", at=at(1, 4)))
     for view, (one, other) in enumerate(zip(as_painted(before), as_painted(less), strict=True)):
         np.testing.assert_array_equal(np.where((one == 1) & (view == 4), 0, one), other)
