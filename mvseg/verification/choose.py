@@ -107,7 +107,8 @@ def choose_leaves(
         usable[: len(proposals)] = _without(proposals, others)
     found = [(replace(matched, instance_ids=ids), row_of)]
     found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
-    has_shapes = _is_seen_around(matched, cameras)
+    is_edited = gone is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
+    has_shapes = _is_seen_around(more[0].to("cpu") if is_edited else matched, cameras)
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
     views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
     is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()

@@ -140,7 +140,9 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
     assert certain == set(after.masks.instance_ids[named].tolist())
     odd = replace(find_in_photos(open_photos(SCENE)), disagreement="the views hardly agree")
     assert apply_edits(odd, Corrections(said)).disagreement == odd.disagreement
-    less = run(*said, Reject(view="v4", at=at(1, 4)))
+    less, alone = (run(*more, Reject(view="v4", at=at(1, 4))) for more in (said, ()))
+    assert less.instances.starts.keys() == alone.instances.starts.keys() == before.instances.starts.keys()
+    assert torch.equal(less.masks.regions.labels, alone.masks.regions.labels)
     for view, (one, other) in enumerate(zip(as_painted(before), as_painted(less), strict=True)):
         np.testing.assert_array_equal(np.where((one == 1) & (view == 4), 0, one), other)
 
