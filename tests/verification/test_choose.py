@@ -260,9 +260,9 @@ def test_cameras_on_one_side_are_said() -> None:
     alike = replace(CAMERAS, R=CAMERAS.R[[0] * 6], t=CAMERAS.t[[0] * 6] + 1e-3 * torch.arange(6)[:, None])
     with pytest.warns(InputWarning, match="the cameras see the leaves from one side only"):
         leaves = choose(matched_of(PROPOSALS, IDS), cameras=alike)
+    none, more = matched_of(PROPOSALS, torch.full_like(IDS, -1)), (matched_of(PROPOSALS, IDS),)
     with pytest.warns(InputWarning, match="from one side only"):  # also where nothing was matched after an edit
-        none = matched_of(PROPOSALS, torch.full_like(IDS, -1))
-        edited = choose(none, cameras=alike, gone=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),))
+        edited = choose(none, cameras=alike, gone=PROPOSALS.select(IDS < 0), more=more)
     assert leaves.surfaces == edited.surfaces == {}
     assert torch.equal(leaves.masks.instance_ids, edited.masks.instance_ids)
     assert len(leaves.masks) == len(REGIONS)
