@@ -229,11 +229,12 @@ def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pyt
 
     def shape(known: Known) -> Result:
         warn("3 masks are cut off")
-        warn("a photo is dark")
+        warn("photo 1 is dark")
+        warn("photo 2 is dark")
         return shape_leaves(known)
 
     monkeypatch.setattr("mvseg.server.open_result.shape_leaves", shape)
-    assert opened.recompute(Corrections(), lambda: False)[2] == ["A photo is dark."]
+    assert opened.recompute(Corrections(), lambda: False)[2] == ["Photo 1 is dark.", "Photo 2 is dark."]
 
 
 def test_it_opens_with_what_the_run_knew_before_edits(

@@ -72,9 +72,18 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
 
 
 def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Known, Tensor]:
-    """The same with the edited masks, matched anew, but for those of leaves that stay as they were `seen` (D,): these
-    keep their ids. Where the views choose, and a person speaks of such leaves only, nothing is matched. And the leaves
-    that stay: those that other masks join do not."""
+    """Match the edited masks anew, but for those of leaves that stay: these keep their ids.
+
+    Where the views choose, and a person speaks of such leaves only, nothing is matched, and what matching said stays.
+
+    Args:
+        known: before the edits.
+        corrected: D masks and their links.
+        seen: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
+
+    Returns:
+        What is known with the D masks, and `seen` without the leaves that other masks join, see `leave_joined`.
+    """
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
     if known.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):

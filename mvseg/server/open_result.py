@@ -191,8 +191,8 @@ class OpenResult:
             result = shape_leaves(edited)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
         told = {_without_numbers(text) for text in (*self.run.said.warnings, *(fate.message for fate in shown.fates))}
-        new = {_without_numbers(text): text for text in messages + more}
-        said = [f"{text[:1].upper()}{text[1:]}." for words, text in new.items() if words not in told]
+        new = [text for text in dict.fromkeys(messages + more) if _without_numbers(text) not in told]
+        said = [f"{text[:1].upper()}{text[1:]}." for text in new]
         return shown, [describe_fate(fate) for fate in shown.fates], said
 
     def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:

@@ -93,17 +93,18 @@ def choose_leaves(
     seen = torch.full_like(matched.instance_ids, -1) if seen is None else seen.cpu()
     ids, origin, stays = matched.instance_ids, matched.origin, seen > 0
     is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
-    is_sure = is_held & ~(matched.is_linked & ~matched.is_corrected & (ids < 1))  # the others: not of one leaf, is said
+    is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # he only says which leaf it does not show
+    is_sure = is_held & ~is_apart
     is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # a person's, and what was cut since
     added = matched.select(is_added)
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
     table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
-    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=seen.where(~is_added, -1))
+    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=seen)
     usable = np.ones(len(table), bool)
     if gone is not None:
         ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
-        others = Masks.concatenate((gone.to("cpu"), matched.select(is_held & ~stays)))
+        others = Masks.concatenate((gone.to("cpu"), matched.select(is_held & is_added)))
         usable[: len(proposals)] = _without(proposals, others)
     found = [(replace(matched, instance_ids=ids), row_of)]
     found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]

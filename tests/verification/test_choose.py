@@ -196,6 +196,19 @@ def test_what_is_said_of_a_leaf_that_stays_as_it_was_seen_changes_no_other_mask(
     assert same.masks.is_linked.tolist() == said.tolist()
 
 
+def test_a_cut_mask_of_a_leaf_that_stays_as_it_was_seen_stays_in_it() -> None:
+    """A person confirms a mask that was cut since it was proposed, and that no other matching has."""
+    row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
+    x1, y1, x2, y2 = REGIONS.boxes[row].tolist()
+    maps = [labels.copy() for labels in TRUE]
+    maps[2][y1 : (y1 + y2) // 2, x1 : (x1 + x2) // 2][maps[2][y1 : (y1 + y2) // 2, x1 : (x1 + x2) // 2] == 2] = 0
+    first = matched_of(PROPOSALS, IDS)
+    cut = replace(first, regions=replace(as_regions(maps)[0], labels=torch.arange(len(IDS))))
+    cut.origin[row] = Origin.CONFIRMED
+    leaves = choose(cut, gone=PROPOSALS.select(IDS < 0), more=(first,), seen=IDS)
+    assert same_partition(leaves, maps)
+
+
 def test_a_mask_that_a_person_keeps_apart_from_a_leaf_does_not_return_to_it() -> None:
     """Nor does a copy of it; where no other leaf takes it, it goes."""
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
