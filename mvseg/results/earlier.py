@@ -1,23 +1,23 @@
 """What a command may replace: only what mvseg wrote for the same purpose, and what is unchanged since.
 
 The run.json of a folder says what kind of folder it is and what it was made of ("output"), and lists the files that
-were written with it and their SHA-256 ("files"). Everything else in the folder belongs to the user (notes, the
-metrics.json of `mvseg eval`), and is copied into the new one. Nothing that a command reads is ever replaced.
+were written with it and their SHA-256 ("files"). Everything else in the folder belongs to the user (edits, notes, the
+metrics.json of `mvseg eval`), and stays where it is. Nothing that a command reads is ever replaced.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from mvseg.errors import InputError
-from mvseg.system.atomic import folder_whole, is_partial, resolve_place, try_writing, write_text_whole
+from mvseg.system.atomic import files_whole, is_partial, resolve_place, try_writing, write_text_whole
 from mvseg.system.file_hash import hash_files
 
 RUN_FILE, POSE_FILE = "run.json", "pose.json"
@@ -65,22 +65,21 @@ RESULT = Output("result")
 
 @contextmanager
 def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[Path]:
-    """A new folder that becomes `out` when the block ends, see `folder_whole`; until then an earlier one stays.
+    """A new folder whose files replace those of an earlier one at `out` when the block ends, see `files_whole`.
 
-    At the end, `run`, as the block left it, is written to the run file with what the folder is and a list of the files,
-    and the user's files in the earlier folder are copied.
+    At the end, `run`, as the block left it, is written to the run file with what the folder is and a list of the files.
+    The user's files in `out` are not touched.
 
     Raises:
         InputError: `out` cannot be written or holds something else, see `check_out`.
     """
     check_out(out, output)
     try:
-        with folder_whole(out) as folder:
+        with files_whole(out, partial(_list_replaced, out, output)) as folder:
             yield folder
             said = run | {"output": output.describe(out), "files": _list_files(folder, output.run_file)}
             text = json.dumps(said, indent=1, default=str)
             (folder / output.run_file).write_text(text + "\n", encoding="utf-8")
-            _keep_user_files(out, folder, output)
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
 
@@ -201,21 +200,23 @@ def _list_files(folder: Path, run_file: str) -> dict[str, str]:
     return {name: hash_files(folder / name) for name in _names_below(folder) if name != run_file}
 
 
-def _keep_user_files(out: Path, folder: Path, output: Output) -> None:
-    """Copy what the user put into the earlier result at `out` into the new one in `folder`.
+def _list_replaced(out: Path, output: Output, folder: Path) -> set[str]:
+    """The files of the earlier output at `out` that the new one, in `folder`, takes the places of.
 
     Raises:
-        InputError: a file of the user has the name of one of the new result; nothing of `out` is changed.
+        InputError: a file of the user has the name of a new one; nothing of `out` is changed.
     """
     place = resolve_place(out)
     if not place.is_dir() or not _holds_some(place):
-        return
-    for name in sorted(_names_below(place) - _read_listed(out, output).keys() - {output.run_file}):
-        if os.path.lexists(folder / name):
+        return set()
+    new, earlier = _names_below(folder), {*_read_listed(out, output), output.run_file}
+    for name in sorted(new):
+        parents = [place / parent for parent in Path(name).parents[:-1]]
+        blocked = [each for each in parents if each.is_symlink() or each.is_file()]
+        if blocked or (name not in earlier and os.path.lexists(place / name)):
             message = "was not written by mvseg, but the new result has a file of this name: move it away"
-            raise InputError(f"{out / name}: {message}")
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(place / name, folder / name, follow_symlinks=False)
+            raise InputError(f"{(blocked or [out / name])[0]}: {message}")
+    return earlier
 
 
 def _names_below(folder: Path) -> set[str]:
@@ -233,10 +234,17 @@ def _read_run(out: Path, output: Output) -> dict[str, Any]:
 
 
 def _read_listed(out: Path, output: Output) -> dict[str, str]:
-    """The files that the run file of an earlier output lists, with their SHA-256."""
-    files = _read_run(out, output).get("files")
+    """The files that the run file of an earlier output lists, with their SHA-256.
+
+    Raises:
+        InputError: it lists none, or one outside of the folder: nothing there may be replaced.
+    """
+    files, place = _read_run(out, output).get("files"), resolve_place(out)
     if not isinstance(files, dict):
         raise _not_ours(out, output)
+    for name in files:
+        if not (place / name).parent.resolve().is_relative_to(place) or Path(name).name in ("", ".."):
+            raise InputError(f"{out / output.run_file}: lists {name}, which is not in this folder")
     return {str(name): str(sha256) for name, sha256 in files.items()}
 
 

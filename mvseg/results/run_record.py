@@ -12,6 +12,7 @@ from mvseg.corrections.corrected import Fate
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
+from mvseg.system.atomic import sweep_abandoned
 
 FORMAT = 2  # of the folder; 1, which says no "format", was of versions before 0.2.0
 
@@ -90,6 +91,7 @@ def load_run(folder: Path) -> RunRecord:
     Raises:
         InputError: this is no result, or one of a newer format; run.json is broken.
     """
+    sweep_abandoned(folder)  # a killed run may have put some of its files there, and not yet the others
     path = folder / RUN_FILE
     if not path.is_file():
         raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer")

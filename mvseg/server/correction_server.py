@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
@@ -106,6 +107,7 @@ class Corrector(Generic[Kind]):
         self.update: dict[str, Any] | None = None
         self.is_closing = False
         self.making_whole = threading.Lock()
+        self.own: set[str] = set()  # `name_edits` of the lists written since the whole result was begun
 
     def page(self) -> bytes:
         """The page with the newest result, and with all edits that were saved: a reload must not lose any; nor those
@@ -135,12 +137,15 @@ class Corrector(Generic[Kind]):
                 raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
             if self._is_changed():
                 raise Refused(HTTPStatus.CONFLICT, CHANGED)
-            corrections = self.opened.mark(corrections)
-            write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
-            self.corrections, self.written = corrections, self._stamp()
+            before, self.corrections = self.corrections, self.opened.mark(corrections)
+            try:
+                self._write()
+            except OSError:
+                self.corrections = before
+                raise
             self.wanted += 1
             self.news.notify_all()
-        return {"saved": len(corrections.edits), "revision": name}
+        return {"saved": len(self.corrections.edits), "revision": name}
 
     def _stamp(self) -> tuple[int, int] | None:
         """What changes when the file of the edits does; None without one."""
@@ -342,30 +347,31 @@ class Corrector(Generic[Kind]):
                 self._refuse_while_learning()
                 if self._is_changed():
                     raise InputError(CHANGED)
-                write_corrections(path, self.corrections)
-                self.written, before = self._stamp(), self.corrections
+                self._write()
+                self.own = {name_edits(self.corrections.edits)}
             with TemporaryDirectory() as place:
                 words = [*self.opened.again(Path(place)), "--corrections", str(path), "--quiet"]
                 command = [sys.executable, "-m", "mvseg.cli", *words]
                 run = subprocess.run(command, capture_output=True, text=True, check=False)
             with self.news:
-                self._keep_newer(before)
+                self._write_newest()
         finally:
             self.making_whole.release()
         if run.returncode:
             raise InputError((run.stderr.strip().splitlines() or ["the run was stopped"])[-1])
         return {"said": run.stdout.strip()}
 
-    def _keep_newer(self, before: Corrections) -> None:
-        """After the folder was replaced: edits that were saved meanwhile may have lain in the one before, and are
-        written again; but over `before` only, not over those of another program."""
-        try:
-            names = {name_edits(each.edits) for each in (before, self._saved())}
-        except InputError:  # theirs, and broken: `_is_changed` says so
-            return
-        if len(names) == 1:
-            write_corrections(self.opened.folder / CORRECTIONS_FILE, self.corrections)
-            self.written = self._stamp()
+    def _write(self) -> None:
+        write_corrections(self.opened.folder / CORRECTIONS_FILE, self.corrections)
+        self.written = self._stamp()
+        self.own.add(name_edits(self.corrections.edits))
+
+    def _write_newest(self) -> None:
+        """After the folder was made anew: write the newest edits again where the file holds earlier ones of this page,
+        whoever put them back; but never over those of another program."""
+        with suppress(InputError):  # theirs, and broken: `_is_changed` says so
+            if name_edits(self._saved().edits) in self.own:
+                self._write()
 
     def close(self) -> None:
         """Let everybody who waits go."""

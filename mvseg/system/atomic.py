@@ -1,7 +1,8 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
 What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile;
-`.NAME.open.lock` is, while a program shows a NAME that may be replaced.
+`.NAME.open.lock` is, while a program shows a NAME that may be replaced. Where a folder holds files of others, too, its
+own move to `.NAME.mvseg-aside` first, and new ones wait complete in `.NAME.mvseg-ready` until each has its place.
 Locks end with their process: files without one were left by a killed process, and are deleted by the next write to
 NAME. On a disk without locks, two processes must not write to one NAME at the same time.
 """
@@ -13,7 +14,7 @@ import os
 import shutil
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -24,6 +25,8 @@ from filelock import FileLock, Timeout
 from mvseg.errors import InputError
 
 PARTIAL, EARLIER, OPEN, LOCK = ".partial", ".earlier", ".open", ".lock"
+ASIDE, READY = ".mvseg-aside", ".mvseg-ready"
+LEFT = (PARTIAL, EARLIER, ASIDE, READY, LOCK)  # what killed runs leave
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # errors of disks without locks
 WAITS = (0.05, 0.2, 0.5)  # seconds between attempts to rename what another program has open
 
@@ -60,26 +63,27 @@ def try_writing(folder: Path) -> None:
 
 def is_partial(path: Path) -> bool:
     """Whether a path is an unfinished or abandoned write, or its lock."""
-    return path.name.startswith(".") and path.name.endswith((PARTIAL, EARLIER, LOCK))
+    return path.name.startswith(".") and path.name.endswith(LEFT)
 
 
 def sweep_abandoned(place: Path) -> None:
     """Delete what killed runs left beside `place` while writing it, unless another run is writing it now.
 
-    If a run was killed between its two renames, nothing is at `place`: the earlier folder is then restored.
+    If a run was killed between its renames, the earlier folder, or all of its files, are restored; if its new files had
+    begun to take their places, the rest follow.
 
     Raises:
         InputError: see `resolve_place`.
     """
     place = resolve_place(place)
-    if any(os.path.lexists(_beside(place, kind)) for kind in (PARTIAL, EARLIER, LOCK)):
+    if any(os.path.lexists(_beside(place, kind)) for kind in LEFT):
         with suppress(InputError, OSError), _locked(_beside(place, LOCK)):  # OSError: of another user
             _clear(place)
 
 
 def sweep_folder(folder: Path) -> None:
     """`sweep_abandoned` for everything in a folder."""
-    names = {path.name for path in folder.iterdir() if is_partial(path)} - {PARTIAL, EARLIER, LOCK}
+    names = {path.name for path in folder.iterdir() if is_partial(path)} - set(LEFT)
     for name in {name[1:].rpartition(".")[0] for name in names}:
         sweep_abandoned(folder / name)
 
@@ -177,6 +181,50 @@ def folder_whole(place: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def files_whole(place: Path, earlier: Callable[[Path], Collection[str]]) -> Iterator[Path]:
+    """A new folder to write into, whose files take the places of earlier ones in `place` when the block ends.
+
+    Everything else in `place` stays where it is: nobody needs to know what it is, nor to stop writing it. Files are
+    moved one by one; what a killed process leaves, the next `sweep_abandoned` undoes, or completes.
+
+    Args:
+        place: the folder; it may be new.
+        earlier: called with the new folder at the end; returns the names of the files in `place` that are replaced.
+
+    Raises:
+        InputError: see `resolve_place`.
+        OSError: the folder cannot be made, or an earlier file cannot be moved; then all of them are as they were.
+    """
+    place = resolve_place(place)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with _writing(place) as partial:
+        partial.mkdir()
+        yield partial
+        names = earlier(partial)
+        if not os.path.lexists(place):
+            _rename(partial, place)
+            return
+        _move_files([name for name in names if os.path.lexists(place / name)], place, _beside(place, ASIDE))
+        _rename(partial, _beside(place, READY))  # from here on the new files win, see `_clear`
+
+
+def _move_files(names: Collection[str], source: Path, target: Path) -> None:
+    """Move files of a folder to the same places in another, and delete the folders that become empty by that."""
+    for name in names:
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        _rename(source / name, target / name)
+    for name in names:
+        for folder in Path(name).parents[:-1]:
+            with suppress(OSError):  # it holds other files, or is gone
+                (source / folder).rmdir()
+
+
+def _files_below(folder: Path) -> list[str]:
+    files = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in files)
+
+
+@contextmanager
 def _writing(place: Path) -> Iterator[Path]:
     """A temporary name beside a place for this process alone; what is there at the end is deleted.
 
@@ -201,11 +249,16 @@ def _beside(place: Path, kind: str) -> Path:
 
 
 def _clear(place: Path) -> None:
-    """Delete what is left of an earlier write, under the lock."""
+    """Complete, undo or delete what is left of an earlier write, under the lock."""
+    ready, aside = _beside(place, READY), _beside(place, ASIDE)
+    if ready.is_dir():
+        _move_files(_files_below(ready), ready, place)
+    elif aside.is_dir():
+        _move_files(_files_below(aside), aside, place)
     earlier = _beside(place, EARLIER)
     if os.path.lexists(earlier) and not os.path.lexists(place):
         _rename(earlier, place)
-    for path in (_beside(place, PARTIAL), earlier):
+    for path in (_beside(place, PARTIAL), earlier, ready, aside):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:

@@ -31,12 +31,13 @@ from mvseg.pipeline.run_scene import run_scene
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.results.earlier import check_out
+from mvseg.results.earlier import RESULT, check_out, replace_result
 from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
 from mvseg.results.scale_bar import fit_scale_bars
+from mvseg.system.file_hash import hash_files
 from mvseg.traits.measure import measure_plant
 from scene_folders import (
     BALLS,
@@ -457,12 +458,12 @@ class TestWholeOrNotAtAll:
         save_result(result, tmp_path / "out", {})
         rename = os.replace
 
-        def fail_into_place(path: Path, target: Path) -> None:
-            if target == tmp_path / "out" and ".earlier" not in path.name:
+        def fail_at_the_traits(path: Path, target: Path) -> None:
+            if path == tmp_path / "out" / "traits.csv":
                 raise OSError(5, "Input/output error")
             rename(path, target)
 
-        monkeypatch.setattr(os, "replace", fail_into_place)
+        monkeypatch.setattr(os, "replace", fail_at_the_traits)
         with pytest.raises(InputError, match="Input/output error"):
             save_result(ids_only(result), tmp_path / "out", {})
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -481,11 +482,45 @@ class TestWholeOrNotAtAll:
         (out / "notes").mkdir()
         (out / "notes" / "day 1.txt").write_text("watered")
         (out / "notes" / "photos").symlink_to(tmp_path / "nowhere")
+        (out / ".git" / "refs").mkdir(parents=True)
+        (out / ".corrections.json.partial").touch()  # of a program that saves edits at this moment
+        kept = [out, out / "metrics.json", out / "notes" / "day 1.txt", out / ".git" / "refs"]
+        before = [path.stat().st_ino for path in kept]
         for _ in range(2):
             save_result(ids_only(result), out, {})
-            assert files_below(out) == IDS_FILES | {"metrics.json", "notes/day 1.txt"}
-            assert (out / "notes" / "day 1.txt").read_text() == "watered"
+            assert files_below(out) == IDS_FILES | {".corrections.json.partial", "metrics.json", "notes/day 1.txt"}
             assert (out / "notes" / "photos").is_symlink()
+            assert [path.stat().st_ino for path in kept] == before  # not even copied
+
+    def test_an_edit_that_is_saved_meanwhile_stays(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(result, out, {})
+        for moment in ("first", "last"):
+            with replace_result(out, {}, RESULT) as folder:
+                (folder / "instances.json").write_text("{}")
+                (out / "corrections.json").write_text(moment)
+            assert (out / "corrections.json").read_text() == moment
+
+    @pytest.mark.parametrize("name", ["../mine.txt", "labels/../../mine.txt", "/mine.txt", ".."])
+    def test_files_outside_of_the_folder_are_never_replaced(self, name: str, result: Result, tmp_path: Path) -> None:
+        save_result(ids_only(result), tmp_path / "out", {})
+        (tmp_path / "mine.txt").write_text("mine")
+        run = json.loads((tmp_path / "out" / "run.json").read_text())
+        path = str(tmp_path / "mine.txt") if name.startswith("/") else name
+        run["files"][path] = hash_files(tmp_path / "mine.txt")
+        (tmp_path / "out" / "run.json").write_text(json.dumps(run))
+        with pytest.raises(InputError, match="which is not in this folder"):
+            save_result(ids_only(result), tmp_path / "out", {})
+        assert (tmp_path / "mine.txt").read_text() == "mine"
+
+    def test_a_folder_that_is_a_link_now_is_not_written_into(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(ids_only(result), out, {})
+        (out / "labels").rename(tmp_path / "theirs")
+        (out / "labels").symlink_to(tmp_path / "theirs")
+        with pytest.raises(InputError, match="labels"):
+            save_result(ids_only(result), out, {})
+        assert (out / "labels").is_symlink()
 
     def test_a_changed_file_of_an_earlier_result_is_not_replaced(self, result: Result, tmp_path: Path) -> None:
         out = tmp_path / "out"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +17,7 @@ from mvseg.system.atomic import (
     EARLIER,
     LOCK,
     PARTIAL,
+    files_whole,
     folder_whole,
     is_partial,
     lock_folder,
@@ -201,6 +203,66 @@ def test_a_run_killed_between_the_two_renames_has_lost_nothing(tmp_path: Path) -
     sweep_abandoned(tmp_path / "out")  # with a result in place, the earlier one is done with
     assert not earlier.exists()
     assert (tmp_path / "out" / "half").exists()
+
+
+def replace_files(place: Path) -> None:
+    """`a` stays by name, `old/b` goes, `new/c` is new."""
+    with files_whole(place, lambda _: ["a", "old/b"]) as folder:
+        (folder / "new").mkdir()
+        (folder / "a").write_text("2")
+        (folder / "new" / "c").write_text("2")
+
+
+def contents(place: Path) -> dict[str, str]:
+    return {path.relative_to(place).as_posix(): path.read_text() for path in place.rglob("*") if path.is_file()}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_files_of_a_folder_are_all_old_or_all_new_wherever_a_process_is_killed(tmp_path: Path) -> None:
+    place, old, new = tmp_path / "out", {"a": "1", "old/b": "1"}, {"a": "2", "new/c": "2"}
+    found = []
+    for step in range(7):
+        (place / "old").mkdir(parents=True, exist_ok=True)
+        for name, text in {**old, "mine": "mine"}.items():
+            (place / name).write_text(text)
+        (place / "empty").mkdir(exist_ok=True)
+        process = os.fork()
+        if not process:
+            replace, steps = os.replace, iter(range(100))
+            atomic.os.replace = lambda *names: os._exit(1) if next(steps) == step else replace(*names)
+            replace_files(place)
+            os._exit(0)
+        is_killed = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        sweep_abandoned(place)
+        left = contents(place)
+        assert left.pop("mine") == "mine"
+        found.append((is_killed, left == new))
+        assert left in (old, new)
+        assert (place / "empty").is_dir()
+        assert list(tmp_path.iterdir()) == [place]
+        shutil.rmtree(place)
+    assert found == [(1, False)] * 3 + [(1, True)] * 2 + [(0, True)] * 2
+
+
+def test_a_file_that_another_program_has_open_leaves_all_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place, replace = tmp_path / "out", os.replace
+    (place / "old").mkdir(parents=True)
+    (place / "a").write_text("1")
+    (place / "old" / "b").write_text("1")
+
+    def refuse(path: Path, target: Path) -> None:
+        if path == place / "old" / "b":
+            raise PermissionError(13, "Access is denied", str(path), 5, str(target))
+        replace(path, target)
+
+    monkeypatch.setattr(os, "replace", refuse)
+    monkeypatch.setattr(atomic, "WAITS", (0.0, 0.0))
+    with pytest.raises(PermissionError, match="Access is denied; a program that has it open must close it"):
+        replace_files(place)
+    assert contents(place) == {"a": "1", "old/b": "1"}
+    assert list(tmp_path.iterdir()) == [place]
 
 
 @pytest.mark.parametrize("refusals", [1, 100])
