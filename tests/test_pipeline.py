@@ -36,16 +36,20 @@ from mvseg.detection.detect_scene import detect_scene
 from mvseg.errors import warn
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
+from mvseg.formats.scene_folder import read_masks
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.pipeline.known import match_given
+from mvseg.pipeline.finish import finish
+from mvseg.pipeline.known import Known, match_given
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
+from mvseg.results.result import Result
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
+from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
@@ -218,12 +222,34 @@ class TestDescribeRun:
     def test_hashes_tell_changed_masks(self, tmp_path: Path) -> None:
         plant = write_scene(tmp_path / "plant")
         masks = plant / "masks"
-        result = run_scene(plant, masks, IDS_ONLY)
-        first, again = (describe_run(result, masks, IDS_ONLY)["inputs"][str(masks)] for _ in range(2))
-        assert first == again
+        first, again = (run_scene(plant, masks, IDS_ONLY) for _ in range(2))
+        assert first.inputs == again.inputs
         path = masks / "001.png"
         path.write_bytes(path.read_bytes() + b"\0")
-        assert describe_run(result, masks, IDS_ONLY)["inputs"][str(masks)] != first
+        assert run_scene(plant, masks, IDS_ONLY).inputs[str(masks)] != first.inputs[str(masks)]
+
+    def test_hashes_are_of_what_was_read(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Masks and cameras change while a run works; and while they are read."""
+        plant = write_scene(tmp_path / "plant")
+        rig, first = plant / "cameras.json", plant / "masks" / "000.png"
+        inputs = {str(path): hash_files(path) for path in (rig, plant / "masks")}
+
+        def change(known: Known) -> Result:
+            for path in (rig, first):
+                path.write_bytes(path.read_bytes() + b"\n")
+            return finish(known)
+
+        monkeypatch.setattr(mvseg.pipeline.run_scene, "finish", change)
+        result = run_scene(plant, plant / "masks", IDS_ONLY)
+        assert describe_run(result, plant / "masks", IDS_ONLY)["inputs"] == inputs
+
+        def read(*args: Any, **kwargs: Any) -> Any:
+            first.write_bytes(first.read_bytes() + b"\n")
+            return read_masks(*args, **kwargs)
+
+        monkeypatch.setattr(mvseg.pipeline.open_scene, "read_masks", read)
+        with pytest.raises(InputError, match="masks: has changed while it was read"):
+            run_scene(plant, plant / "masks", IDS_ONLY)
 
 
 @pytest.mark.parametrize("is_wanted", [True, False])

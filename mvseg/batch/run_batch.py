@@ -22,6 +22,7 @@ from mvseg.errors import InputError
 from mvseg.results.earlier import Output, check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 from mvseg.system.running import progress_bar
+from mvseg.system.say import plain
 
 SHOWN = 4  # names of running scenes beside the progress bar
 
@@ -169,7 +170,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
 
 
 def _say(text: str) -> None:
-    tqdm.write(f"mvseg: {text}", file=sys.stderr)
+    tqdm.write(f"mvseg: {plain(text)}", file=sys.stderr)
 
 
 def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from io import TextIOWrapper
 
+from mvseg.system.say import say
+
 INTERRUPTED = 130
 __all__ = ["main"]
 
@@ -31,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not _is_interruption(error):
             raise
-    print("mvseg: interrupted", file=sys.stderr)
+    say("mvseg: interrupted", to_stderr=True)
     return INTERRUPTED
 
 

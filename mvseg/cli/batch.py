@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run, read_workers
+from mvseg.system.say import say
 
 SOME_FAILED = 3
 
@@ -42,9 +42,9 @@ def run(args: Namespace) -> int:
     total, tables = counts.done + counts.failed, out / "tables"
     if counts.warned:
         some = f"{counts.warned} of {counts.done} scenes have warnings"
-        print(f"mvseg: warning: {some}, see {tables / 'summary.csv'}", file=sys.stderr)
+        say(f"mvseg: warning: {some}, see {tables / 'summary.csv'}", to_stderr=True)
     if counts.failed:
-        print(f"mvseg: {counts.failed} of {total} scenes failed, see {tables / 'failures.csv'}", file=sys.stderr)
+        say(f"mvseg: {counts.failed} of {total} scenes failed, see {tables / 'failures.csv'}", to_stderr=True)
     kept = f" ({counts.kept} of them before)" if counts.kept else ""
-    print(f"{out}: {counts.done} of {total} scenes are done{kept}")
+    say(f"{out}: {counts.done} of {total} scenes are done{kept}")
     return SOME_FAILED if counts.failed else 0

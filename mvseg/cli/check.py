@@ -5,7 +5,6 @@ page of `mvseg target`. Exit code 0: nothing would go wrong; 1: something would;
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared
 from mvseg.errors import InputError, collect_warnings
+from mvseg.system.say import say
 
 if TYPE_CHECKING:
     from mvseg.checks.check_scene import Check
@@ -71,9 +71,9 @@ def run(args: Namespace) -> int:
     found += [each for each in check.findings if unread is None or not each.what.startswith(NOTHING_TO_SEE)]
     _print_table(check)
     for finding in sorted(found, key=lambda each: ("error", "warning", "note").index(each.level)):
-        print(f"{finding.level:8} {finding.where:8} {finding.what}")
+        say(f"{finding.level:8} {finding.where:8} {finding.what}")
     if not found and unread is None:
-        print("no problems found")
+        say("no problems found")
     if args.out is not None:
         _write(args.out, check, found)
     if unread is not None:
@@ -93,18 +93,18 @@ def _run_target(args: Namespace) -> int:
         check_file(args.out / TARGET_FILE, b'"shapes"')
     check = check_target(args.scene, bar=BAR if args.bar is None else args.bar)
     off = f"{check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags"
-    print(f"{args.scene}: {check.num_tags} tags, {off}")
+    say(f"{args.scene}: {check.num_tags} tags, {off}")
     line = "{:12} {:>13} {:>13} {:>9} {:>7} {:>5} {:>10}"
-    print("\n" + line.format("shape", "true", "measured", "sd", "error", "95 %", "photos"))
+    say("\n" + line.format("shape", "true", "measured", "sd", "error", "95 %", "photos"))
     for shape in check.shapes:
         areas = [f"{area:.1f} mm^2" for area in (shape.true_area, shape.area)]
         holds, photos = "yes" if shape.holds else "no", f"{shape.num_views} of {shape.num_masks}"
-        print(line.format(shape.name, *areas, f"{shape.sd:.1f}", f"{shape.error:+.1%}", holds, photos))
-    print(f"\n{check.verdict}")
+        say(line.format(shape.name, *areas, f"{shape.sd:.1f}", f"{shape.error:+.1%}", holds, photos))
+    say(f"\n{check.verdict}")
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
         write_text_whole(args.out / TARGET_FILE, json.dumps(check.describe(), indent=1) + "\n")
-        print(f"{args.out}: {TARGET_FILE}", file=sys.stderr)
+        say(f"{args.out}: {TARGET_FILE}", to_stderr=True)
     return 0 if check.is_right else WRONG
 
 
@@ -126,13 +126,13 @@ def _print_table(check: Check) -> None:
 
     scene, cameras = check.scene, check.scene.cameras
     up = "unknown" if scene.up is None else "{:.2f} {:.2f} {:.2f}".format(*scene.up)
-    print(f"{scene.source}: {len(cameras)} cameras, unit {scene.unit or 'unknown'}, up {up}")
+    say(f"{scene.source}: {len(cameras)} cameras, unit {scene.unit or 'unknown'}, up {up}")
     sees, photos = check.coverage.sees, sum(each.size is not None for each in check.photos)
-    print(f"{int(sees.sum())} of {len(cameras)} look at one point; {photos} photos", end="")
-    print("" if check.regions is None else f"; {len(check.regions)} masks", end="\n\n")
+    say(f"{int(sees.sum())} of {len(cameras)} look at one point; {photos} photos", end="")
+    say("" if check.regions is None else f"; {len(check.regions)} masks", end="\n\n")
     width = max(4, *(len(view.name) for view in scene.views))
     line = f"{{:{width}}} {{:>11}} {{:>6}} {{:>6}} {{:>8}} {{:>6}} {{:>7}} {{:>5}} {{:>7}}"
-    print(line.format("view", "size", "field", "next", "photo", "masks", "border", "fit", "miss"))
+    say(line.format("view", "size", "field", "next", "photo", "masks", "border", "fit", "miss"))
     shown = {
         "next_deg": "{:.0f}°",
         "photo": "{}",
@@ -143,8 +143,8 @@ def _print_table(check: Check) -> None:
     }
     for row, angle, size in zip(_rows(check), field_of_view(cameras), cameras.sizes.tolist(), strict=True):
         known = ["-" if row[name] is None else form.format(row[name]) for name, form in shown.items()]
-        print(line.format(row["view"], "{} x {}".format(*size), f"{angle:.0f}°", *known))
-    print()
+        say(line.format(row["view"], "{} x {}".format(*size), f"{angle:.0f}°", *known))
+    say()
 
 
 def _rows(check: Check) -> list[dict[str, Any]]:
@@ -193,4 +193,4 @@ def _write(out: Path, check: Check, findings: list[Finding]) -> None:
     write_text_whole(out / CHECK_FILE, json.dumps(content, indent=1) + "\n")
     picture = draw_cameras(check.scene, check.coverage, tuple(sorted(off)))
     write_whole(out / PLAN_FILE, lambda partial: write_png(partial, picture))
-    print(f"{out}: {CHECK_FILE}, {PLAN_FILE}", file=sys.stderr)
+    say(f"{out}: {CHECK_FILE}, {PLAN_FILE}", to_stderr=True)

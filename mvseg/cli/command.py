@@ -20,6 +20,7 @@ from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.errors import InputError, InputWarning, say_fault
 from mvseg.system.running import running
+from mvseg.system.say import say
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 TERMINATED = 143
@@ -89,7 +90,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (OSError, MemoryError) as error:
         return complain(InputError(say_fault(error)))
     except Terminated:
-        print("mvseg: stopped by SIGTERM", file=sys.stderr)
+        say("mvseg: stopped by SIGTERM", to_stderr=True)
         return TERMINATED
 
 
@@ -105,7 +106,7 @@ def _show_warning(
     text = f"mvseg: warning: {message}\n"
     if not issubclass(category, InputWarning):
         text = warnings.formatwarning(message, category, filename, lineno, line)
-    print(text, end="", file=sys.stderr if file is None else file)
+    say(text, end="", to_stderr=True)
 
 
 def _parse(arguments: Sequence[str]) -> Namespace:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
+
+from mvseg.system.say import say
 
 BAD_INPUT = 2
 
@@ -29,7 +30,7 @@ def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence
         known: verbs or options, one of which was perhaps meant by a name that nothing has.
     """
     sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), known)
-    print(f"mvseg: error: {sentence}", file=sys.stderr)
+    say(f"mvseg: error: {sentence}", to_stderr=True)
     return BAD_INPUT
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 from contextlib import ExitStack, suppress
 from contextvars import copy_context
@@ -12,6 +11,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared
 from mvseg.errors import InputError
+from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -48,23 +48,23 @@ def run(args: Namespace) -> int:
         now = stack.enter_context(running(num_workers=1 if has_tracks else num_workers, keep=True))
         opened: OpenResult | OpenTracks = OpenTracks(folder, args.plant) if has_tracks else OpenResult(folder)
         if opened.notice:
-            print(f"mvseg: {opened.notice}", file=sys.stderr)
+            say(f"mvseg: {opened.notice}", to_stderr=True)
         corrector = Corrector[OpenResult | OpenTracks](opened)
         server = stack.enter_context(CorrectionServer(corrector))
         computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:
             computing.start()
             load_ahead(now.workers, num_workers, "mvseg.reconstruction.surface.fit_surfaces")
-            print(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.", flush=True)
+            say(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.")
             if not args.no_browser:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
             if opened.learner is not None and opened.learner.is_learned:
-                print("\nWhat the detector has learned is in the whole result, if the page made it since.", flush=True)
+                say("\nWhat the detector has learned is in the whole result, if the page made it since.")
             what, verb = ("tables and page", "track") if has_tracks else ("whole result", "infer")
             command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE, verb=verb)
-            print(f"\nThe {what} with these corrections: {command}", flush=True)
+            say(f"\nThe {what} with these corrections: {command}")
         finally:
             corrector.close()
             stack.close()  # the workers stop, whatever they are doing

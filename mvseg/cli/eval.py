@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.errors import InputError
+from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -32,7 +32,7 @@ def run(args: Namespace) -> int:
 
     result = find_result(args.result)
     if result != args.result:
-        print(f"mvseg: {result}: the only result in {args.result}", file=sys.stderr)
+        say(f"mvseg: {result}: the only result in {args.result}", to_stderr=True)
     check_file(result / "metrics.json", b'"s_match"')
     regions, truth = read_instances(result, args.truth)
     ids, true = regions.labels, shown_instances(regions, truth)
@@ -45,10 +45,10 @@ def run(args: Namespace) -> int:
     metrics |= {f"iou_{each.leaf}_{each.true}": each.iou for each in agreement.shared}
     if metrics["no_instance"]:
         message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: left out of the scores of the ids"
-        print(f"mvseg: warning: {message}", file=sys.stderr)
+        say(f"mvseg: warning: {message}", to_stderr=True)
     for name, value in metrics.items():
         shown = ",".join(map(str, value)) or "none" if isinstance(value, tuple) else value
-        print(f"{name:18} {shown:.4f}" if isinstance(shown, float) else f"{name:18} {shown}")
+        say(f"{name:18} {shown:.4f}" if isinstance(shown, float) else f"{name:18} {shown}")
     if not (result / "instances.json").is_file():  # labels of somebody
         return 0
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from jsonargparse import ArgumentParser, Namespace
@@ -11,6 +10,7 @@ from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_ru
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
+from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def run(args: Namespace) -> int:
     if args.detector is not None:
         raise InputError("--detector is of --again; the weights of a new run are --detect.weights")
     if args.scene is None:
-        print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
+        say("mvseg: no SCENE given: this is the plant that ships with mvseg", to_stderr=True)
     scene = args.scene or demo_scene()
     out = args.out or DEFAULT_OUT / scene_name(scene)
     run_one_scene(

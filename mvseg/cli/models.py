@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from jsonargparse import ArgumentParser, Namespace
 
+from mvseg.system.say import say
+
 
 def add_options(parser: ArgumentParser) -> None:
     """The verb has none."""
@@ -18,5 +20,5 @@ def run(args: Namespace) -> int:
         measured = [scores[name] for name in ("mask_AP", "mask_AP50") if scores.get(name) is not None]
         shown = "mask AP {:.3f}, AP50 {:.3f}".format(*measured) if len(measured) == 2 else "not measured"
         size = f"{entry.weights.stat().st_size / 1e6:.0f} MB" if entry.weights.is_file() else "weights missing"
-        print(f"{entry.name:15} {size}, {shown}; {entry.weights.parent / 'card.md'}")
+        say(f"{entry.name:15} {size}, {shown}; {entry.weights.parent / 'card.md'}")
     return 0

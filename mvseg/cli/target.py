@@ -8,6 +8,8 @@ from pathlib import Path
 
 from jsonargparse import ArgumentParser, Namespace
 
+from mvseg.system.say import say
+
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
@@ -22,5 +24,5 @@ def run(args: Namespace) -> int:
     check_file(args.page, SIGN)
     write_target(args.page)
     scale = f"--distance marker:0 marker:{len(tag_corners()) - 1} {tag_distance():.2f} --unit mm"
-    print(f"{args.page}: print it at 100 %, in colour. Of photos of it, mvseg pose needs {scale}")
+    say(f"{args.page}: print it at 100 %, in colour. Of photos of it, mvseg pose needs {scale}")
     return 0

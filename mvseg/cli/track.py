@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared, read_workers
 from mvseg.errors import InputError
+from mvseg.system.say import say
 from mvseg.tracking.config import Pots
 
 if TYPE_CHECKING:
@@ -55,16 +55,16 @@ def run(args: Namespace) -> int:
     )
     for plant in tracked:
         for sentence in plant.warnings:
-            print(f"mvseg: warning: {sentence}", file=sys.stderr)
+            say(f"mvseg: warning: {sentence}", to_stderr=True)
     failed = [plant.sentence for plant in tracked if plant.sentence]
     for sentence in failed:
-        print(f"mvseg: {sentence}", file=sys.stderr)
+        say(f"mvseg: {sentence}", to_stderr=True)
     num_dates, num_tracks = sum(plant.dates for plant in tracked), sum(plant.tracks for plant in tracked)
     done = len(tracked) - len(failed)
     longest = max(plant.days for plant in tracked)
     span = f"{longest:.3g} {'day' if longest == 1 else 'days'} apart{' at most' if num_dates > 2 else ''}"
     what = f"{num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'}"
-    print(f"{asked.folder}: {what} on {num_dates} dates, {span}")
+    say(f"{asked.folder}: {what} on {num_dates} dates, {span}")
     return SOME_FAILED if failed else 0
 
 
@@ -94,7 +94,7 @@ def _read_results(args: Namespace) -> RecordedTracks:
             raise InputError(f"{len(results)} results are given without --times, expected one time for each")
         plants, num_single = list_plants(results[0])
         if num_single:
-            print(f"mvseg: {num_single} plants have one date and are left out", file=sys.stderr)
+            say(f"mvseg: {num_single} plants have one date and are left out", to_stderr=True)
     else:
         if len(times) != len(results):
             raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")

@@ -94,9 +94,17 @@ def find_weights(name: str) -> Path | None:
 
 def weights_path(name: str | Path) -> Path:
     """The weights file of a shipped detector, or that of a result whose plant a detector has learned, or else the path
-    itself, which need not exist; see `find_weights`."""
+    itself, which need not exist; see `find_weights`.
+
+    Raises:
+        InputError: it is a folder without a detector that has learned.
+    """
+    if (shipped := find_weights(str(name))) is not None or not Path(name).is_dir():
+        return shipped or Path(name)
     learned = Path(name) / DETECTOR_FILE
-    return find_weights(str(name)) or (learned if learned.is_file() else Path(name))
+    if not learned.is_file():
+        raise InputError(f"{name}: holds no {DETECTOR_FILE}, expected a result whose detector has learned its plant")
+    return learned
 
 
 def load_detector(weights: str | Path, *, image_size: int | None = None, min_score: float | None = None) -> MaskRCNN:

@@ -1,4 +1,8 @@
-"""Writes meshes through trimesh: a PLY per instance, and one GLB with a node per instance."""
+"""Writes meshes: a PLY per instance, and through trimesh one GLB with a node per instance.
+
+Wherever the world's origin is, meshes stay whole: PLY has numbers of 64 bits (trimesh writes 32), and GLB, which knows
+32 bits only, has vertices about the middle of the plant, and a node that moves them there.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +15,22 @@ import trimesh
 from numpy.typing import NDArray
 
 ROOT = "plant"  # the node above all others in a GLB
+# What PLY says of a vertex: name, kind in NumPy and in PLY.
+VERTEX = (
+    *((axis, "<f8", "double") for axis in "xyz"), *((f"n{axis}", "<f4", "float") for axis in "xyz"),
+    *((color, "u1", "uchar") for color in ("red", "green", "blue", "alpha")), ("instance_id", "<i4", "int"),
+)  # fmt: skip
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
     """A closed mesh with at most `max_faces` triangles, by quadric decimation, which may damage the boundary of an open
     one; smaller meshes are returned as they are."""
-    return mesh if len(mesh.faces) <= max_faces else mesh.simplify_quadric_decimation(face_count=max_faces)
+    if len(mesh.faces) <= max_faces:
+        return mesh
+    middle = mesh.bounds.mean(0)  # the library computes with 32 bits
+    near = trimesh.Trimesh(mesh.vertices - middle, mesh.faces, process=False)
+    near = near.simplify_quadric_decimation(face_count=max_faces)
+    return trimesh.Trimesh(near.vertices + middle, near.faces, process=False)
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *, instance_id: int) -> None:
@@ -24,10 +38,18 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *,
 
     Every vertex has the RGB colour (0 to 255), and the id as its property `instance_id`.
     """
-    colors = np.tile(np.array([*color, 255], np.uint8), (len(mesh.vertices), 1))
-    colored = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
-    colored.vertex_attributes["instance_id"] = np.full(len(mesh.vertices), instance_id, np.int32)
-    path.write_bytes(trimesh.exchange.ply.export_ply(colored, vertex_normal=True))
+    vertices = np.zeros(len(mesh.vertices), [(name, kind) for name, kind, _ in VERTEX])
+    for names, columns in (("xyz", mesh.vertices), (("nx", "ny", "nz"), mesh.vertex_normals)):
+        for name, column in zip(names, columns.T, strict=True):
+            vertices[name] = column
+    for name, value in zip(("red", "green", "blue", "alpha", "instance_id"), (*color, 255, instance_id), strict=True):
+        vertices[name] = value
+    faces = np.zeros(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
+    faces["count"], faces["corners"] = 3, mesh.faces
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
+    lines += [f"property {kind} {name}" for name, _, kind in VERTEX]
+    lines += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    path.write_bytes("\n".join(lines).encode("ascii") + vertices.tobytes() + faces.tobytes())
 
 
 def write_glb(
@@ -39,20 +61,24 @@ def write_glb(
     about: Mapping[str, Any] | None = None,
     extras: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write meshes as one binary glTF, with normals, in world coordinates below a node that transforms them.
+    """Write meshes as one binary glTF, with normals, below a node that transforms them.
 
-    Each name gets a node and a double-sided material of its own: a leaf may be an open surface.
+    Vertices are about the middle of all meshes; the node takes them from there to glTF's world. Each name gets a node
+    and a double-sided material of its own: a leaf may be an open surface.
 
     Args:
         path: the file.
         meshes: {name: mesh}.
         colors: {name: RGB, 0 to 255}, sRGB; the file has them linear, as glTF requires.
-        matrix: (4, 4) gltf_from_world, of the node above all others; glTF is in metres, +y is up. None: the identity.
+        matrix: (4, 4) gltf_from_world; glTF is in metres, +y is up. None: the identity.
         about: the `extras` of that node.
         extras: {name: the `extras` of its node}.
     """
     scene = trimesh.Scene()
-    root = np.eye(4) if matrix is None else matrix
+    ends = np.array([mesh.bounds for mesh in meshes.values() if len(mesh.vertices)]).reshape(-1, 3)
+    middle = (ends.min(0) + ends.max(0)) / 2 if len(ends) else np.zeros(3)
+    root = np.eye(4) if matrix is None else matrix.copy()
+    root[:3, 3] += root[:3, :3] @ middle
     scene.graph.update(frame_from=scene.graph.base_frame, frame_to=ROOT, matrix=root, metadata=dict(about or {}))
     for name, mesh in meshes.items():
         material = trimesh.visual.material.PBRMaterial(
@@ -64,7 +90,8 @@ def write_glb(
         )
         visual = trimesh.visual.TextureVisuals(material=material)
         normals = _unit_normals(mesh)
-        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, visual=visual, process=False)
+        near = mesh.vertices - middle
+        painted = trimesh.Trimesh(near, mesh.faces, vertex_normals=normals, visual=visual, process=False)
         said = dict((extras or {}).get(name, {}))
         scene.add_geometry(painted, node_name=name, geom_name=name, parent_node_name=ROOT, metadata=said)
     path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))

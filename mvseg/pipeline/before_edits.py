@@ -27,14 +27,16 @@ from mvseg.scene import Cameras
 from mvseg.system.running import now_running
 from mvseg.verification.choose import LeftOut
 
+MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
 FIELDS = ("matching", "instances", "proposals", "matched", "left", "poses", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [Cameras, Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality]
 CLASSES += [RefinedPoses, Regions]
 
 
-def pack_known(known: Known, said: Sequence[str]) -> bytes:
-    """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`)."""
+def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
+    """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`). None where it is
+    too much to be read again."""
     packed = io.BytesIO()
     kept = now_running().kept or {}
     torch.save(
@@ -48,7 +50,7 @@ def pack_known(known: Known, said: Sequence[str]) -> bytes:
         },
         packed,
     )
-    return zlib.compress(packed.getvalue(), 1)
+    return zlib.compress(packed.getvalue(), 1) if packed.tell() <= MOST_BYTES else None
 
 
 def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | None:
@@ -56,8 +58,11 @@ def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | No
     where the run keeps what it computed. There are no looks: a detector that is to learn looks again. None: it is of
     other views, or something else."""
     try:
+        inflated = zlib.decompressobj().decompress(content, MOST_BYTES + 1)
+        if len(inflated) > MOST_BYTES:
+            return None
         with torch.serialization.safe_globals(CLASSES):
-            packed = torch.load(io.BytesIO(zlib.decompress(content)), map_location="cpu", weights_only=True)
+            packed = torch.load(io.BytesIO(inflated), map_location="cpu", weights_only=True)
         if packed["views"] != opened.names:
             return None
         scene = replace(opened.scene, cameras=packed["cameras"])

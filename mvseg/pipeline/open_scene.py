@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -12,7 +13,7 @@ from torch import Tensor
 from mvseg.config import ENOUGH_VIEWS, RunConfig
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.same_scene import named_views
-from mvseg.errors import warn
+from mvseg.errors import InputError, warn
 from mvseg.formats.find_views import natural_order
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
@@ -21,6 +22,7 @@ from mvseg.masks import Masks
 from mvseg.matching.match import check_baselines
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.scene import Scene
+from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
 from mvseg.traits.up import place_scene
 
@@ -36,6 +38,7 @@ class Opened:
         mask_kind: what those were read from ("COCO", "label images", ...); "" without any.
         views_left_out: names of the other views.
         config: the options of all stages.
+        inputs: {file or folder: SHA-256 as it was read} of cameras and masks, or of the detector's weights.
     """
 
     scene: Scene
@@ -44,6 +47,7 @@ class Opened:
     mask_kind: str
     views_left_out: tuple[str, ...]
     config: RunConfig
+    inputs: Mapping[Path, str] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -80,7 +84,9 @@ def open_scene(
     """
     with timed("load"):
         folder, masks = Path(folder), None if masks is None else Path(masks)
+        before = {} if masks is None else {masks: _hash_masks(masks)}
         loaded = load_scene(folder)
+        inputs = before | ({} if loaded.source is None else {loaded.source: hash_files(loaded.source)})
         photos = Photos(loaded)
         whole = place_scene(loaded, photos, scale=config.scale, unit=config.unit, up=config.up)
         taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections)
@@ -91,15 +97,34 @@ def open_scene(
         photos = photos.select(scene, taken.tolist())
         if masks is None:
             require_photos(scene, folder)
-            return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config)
+            inputs |= _hash_weights(config)
+            return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config, inputs=inputs)
         found = recognise_masks(whole, masks)
         regions = read_masks(whole, found, crowd=config.coco_crowd, categories=config.category_names)
+        if before != {masks: _hash_masks(masks)}:
+            raise InputError(f"{masks}: has changed while it was read, expected masks that are complete")
         if left_out:
             num_given, regions = len(regions), regions.of_views(taken)
             message = f"{len(taken)} of {len(whole.views)} views are taken (views is {config.views})"
             warn(f"{masks}: {num_given - len(regions)} of {num_given} masks are left out: {message}")
         given = Masks.of(regions)
-        return Opened(scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config)
+        return Opened(
+            scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config, inputs=inputs
+        )
+
+
+def _hash_masks(masks: Path) -> str:
+    try:
+        return hash_files(masks)
+    except OSError:
+        return ""  # what reads them says why they cannot be read
+
+
+def _hash_weights(config: RunConfig) -> dict[Path, str]:
+    from mvseg.detectors.zoo import weights_path  # loads torchvision
+
+    path = weights_path(config.detect.weights)
+    return {path: hash_files(path)} if path.is_file() else {}
 
 
 def _take_views(scene: Scene, most: int | Literal["all"], corrections: Corrections | None) -> Tensor:

@@ -21,6 +21,7 @@ from mvseg.pipeline.finish import finish
 from mvseg.pipeline.known import match_given
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.results.result import Result
+from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 
 
@@ -54,6 +55,8 @@ def run_scene(
     """
     if isinstance(corrections, Path | str):
         corrections = load_corrections(corrections)
+    edits = None if corrections is None else corrections.source
+    read = {} if edits is None else {edits: hash_files(edits)}
     with running(keep=True) as now, TemporaryDirectory() as place:
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
@@ -71,4 +74,5 @@ def run_scene(
                 kept.delete_others()
         result = finish(apply_edits(known, corrections))
         before = pack_known(known, said)
-    return replace(result, corrections=corrections, before_edits=before, seconds=now.seconds)
+    inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
+    return replace(result, corrections=corrections, before_edits=before, seconds=now.seconds, inputs=inputs)

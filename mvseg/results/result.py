@@ -116,6 +116,7 @@ class Result:
         fates: the outcome of each of them.
         learned: by the detector from this scene.
         before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_known`); None: nothing is kept.
+        inputs: {path: SHA-256} of the cameras, masks, weights and corrections, as the run read them.
         run: that made a result which was loaded from its folder; None before it was saved.
     """
 
@@ -136,6 +137,7 @@ class Result:
     fates: tuple[Fate, ...] = ()
     learned: Learned = NOTHING_LEARNED
     before_edits: bytes | None = None
+    inputs: Mapping[str, str] = field(default_factory=dict)
     run: RunRecord | None = None
 
     def __repr__(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
@@ -30,8 +29,8 @@ from mvseg.results.read import load_learned
 from mvseg.results.result import NOTHING_LEARNED, Learned, Result
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
-from mvseg.system.file_hash import hash_files
 from mvseg.system.running import now_running, running, timed
+from mvseg.system.say import say
 
 
 def run_one_scene(
@@ -67,7 +66,7 @@ def run_one_scene(
     with ExitStack() as stack:
         stack.enter_context(running(stages=_plan_stages(config, masks)))
         if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
-            print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
+            say(f"mvseg: going on from the detections in {cache}, for equal photos and options", to_stderr=True)
         with running(num_workers=num_workers):
             place_of_weights = Path(stack.enter_context(TemporaryDirectory()))
             result, messages = solve_scene(
@@ -80,11 +79,11 @@ def run_one_scene(
             )
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if config.views else "; --views all takes all"
-            print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
+            say(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", to_stderr=True)
         card, is_shown = make_card(result, out, scene=scene, masks=masks), now_running().progress
         for message in messages:
             if not (is_shown and card.doubt and card.doubt in message):
-                print(f"mvseg: warning: {message}", file=sys.stderr)
+                say(f"mvseg: warning: {message}", to_stderr=True)
         if learned.weights is not None:
             result = replace(result, learned=learned)
         with timed("write"):
@@ -93,13 +92,13 @@ def run_one_scene(
             delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
-    print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
+    say(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
     if is_shown:
         lines = {"found": card.found, "in doubt": card.doubt, "next": card.next_step}
         lines |= {"look at": str(out / REPORT_FILE)} if config.report else {}
         for word, sentence in lines.items():
             if sentence:
-                print(f"mvseg: {word}: {sentence}", file=sys.stderr)
+                say(f"mvseg: {word}: {sentence}", to_stderr=True)
 
 
 def _plan_stages(config: RunConfig, masks: Path | None) -> tuple[tuple[str, ...], ...]:
@@ -146,7 +145,7 @@ def run_again(
     """
     run = read_recorded(folder)
     for change in run.changes:
-        print(f"mvseg: {change}", file=sys.stderr)
+        say(f"mvseg: {change}", to_stderr=True)
     learned = load_learned(folder, run.said)
     if detector is not None:
         learned = replace(learned, weights=detector.read_bytes(), rounds=1)
@@ -222,18 +221,13 @@ def describe_run(
     if config.reconstruct is None:
         for name in ("reconstruct", "traits", "scale", "unit", "up"):
             del options[name]
-    if masks is None:
-        from mvseg.detectors.zoo import weights_path  # loads torchvision
-
-    sources = [result.scene.source, masks or weights_path(config.detect.weights)]
-    corrections = None if result.corrections is None else result.corrections.source
-    if corrections is not None:
-        sources.append(corrections)
+    elif Path(config.detect.weights).exists():  # a file of the user, whatever the working directory is
+        options["detect"]["weights"] = str(Path(config.detect.weights).resolve())
     return {
         **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
-        "inputs": {str(path.resolve()): hash_files(path) for path in sources if path is not None},
+        "inputs": dict(result.inputs),
         "photo_sha256": _hash_photos(result),
         "config": options,
         "warnings": list(messages),

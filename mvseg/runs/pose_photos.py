@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -28,6 +27,7 @@ from mvseg.results.earlier import Output, check_out, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
 from mvseg.system.running import now_running
+from mvseg.system.say import say
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
 
@@ -85,10 +85,10 @@ def pose_photos(
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
     for message in messages:
-        print(f"mvseg: warning: {message}", file=sys.stderr)
+        say(f"mvseg: warning: {message}", to_stderr=True)
     if now_running().progress:
-        print(summarize_poses(out, structure, placement=placement, scene=scene))
-        print(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
+        say(summarize_poses(out, structure, placement=placement, scene=scene))
+        say(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
     return scene
 
 

@@ -28,6 +28,7 @@ from mvseg.results.earlier import Output, replace_result
 from mvseg.runs.pose_photos import check_folders
 from mvseg.scene import Scene
 from mvseg.system.running import now_running, progress_bar
+from mvseg.system.say import say
 
 TURNTABLE_FILE = "turntable.json"
 ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
@@ -92,10 +93,10 @@ def pose_board_photos(
         warn(sentence)
     if now_running().progress:
         share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
-        print(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
+        say(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
         for name, length in lengths.items():
-            print(f"  {name}: {length.describe()}")
-        print(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
+            say(f"  {name}: {length.describe()}")
+        say(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
     return scene
 
 
@@ -135,7 +136,7 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
     if now_running().progress:
         has_step = isinstance(angles, float)
         described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
-        print(f"{out}: {len(files)} photos at {described}")
+        say(f"{out}: {len(files)} photos at {described}")
     return replace(scene, source=out / TURNTABLE_FILE)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,8 @@ from mvseg.system.file_hash import hash_files
 GONE = {  # options of earlier versions: what to say of a result that was made with one
     "color_card": "its colours were corrected by a colour card, and will be those of the photos as they are now.",
 }
-PLACES = ("scene", "out", "masks", "corrections")  # of run.json's config: what the run read and wrote
+READ = ("scene", "masks", "corrections")
+PLACES = (*READ, "out")  # of run.json's config: what the run read and wrote
 
 
 @dataclass(frozen=True)
@@ -95,10 +97,18 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
         changes.append(
             f"mvseg {said.mvseg[:60]} made this result, and this is {__version__}: what it computes may differ."
         )
+    named = [find_place(folder, said, Path(str(said.config[name]))).resolve() for name in READ if said.config.get(name)]
+    if isinstance(detect := said.config.get("detect"), dict):
+        from mvseg.detectors.zoo import weights_path  # loads torchvision
+
+        with suppress(InputError):  # they are gone, which is said where they are wanted
+            named.append(weights_path(str(detect.get("weights"))).resolve())
     for stated, sha256 in said.inputs.items():
         path = find_place(folder, said, Path(stated))
-        if not path.exists():
+        if not (path.is_dir() or path.is_file()):
             changes.append(f"{path}: is gone since this result was made.")
+        elif not any(path.resolve().is_relative_to(place) for place in named):
+            changes.append(f"{path}: is not looked at, since the run did not read it.")
         elif hash_files(path) != sha256:
             changes.append(f"{path}: has changed since this result was made.")
     changes += _list_other_photos(folder, said)
@@ -110,7 +120,7 @@ def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
     if said.photos is None:
         return []
     place, count = find_place(folder, said, said.photos), len(said.photo_sha256)
-    gone = [name for name in said.photo_sha256 if not (place / name).is_file()]
+    gone = [name for name in said.photo_sha256 if not _is_file_below(place, name)]
     others = [
         name for name, sha256 in said.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
     ]
@@ -120,6 +130,10 @@ def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
         for what, names in facts.items()
         if names
     ]
+
+
+def _is_file_below(place: Path, name: str) -> bool:
+    return (place / name).is_file() and (place / name).absolute().is_relative_to(place.absolute()) and ".." not in name
 
 
 def _read_config(folder: Path, said: RunRecord) -> RunConfig:

@@ -20,6 +20,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from tqdm import tqdm
 
+from mvseg.system.say import plain
 from mvseg.system.worker_pool import start_workers
 
 
@@ -165,7 +166,7 @@ def say(sentence: str) -> None:
     if (report := now_running().report) is not None:
         report(sentence)
     elif now_running().progress:
-        tqdm.write(f"mvseg: {sentence}", file=sys.stderr)
+        tqdm.write(f"mvseg: {plain(sentence)}", file=sys.stderr)
 
 
 def progress_bar(

@@ -94,6 +94,7 @@ def area_deciles(areas: Floats, sds: Floats, *, method: str) -> dict[str, Measur
 
 def hull_volume(points: Tensor) -> Tensor:
     """Volume of the convex hull of points (P, 3) float64; 0 for points in one plane."""
+    points = points - points.detach().mean(0)  # far from the origin, volumes to it would cancel
     try:
         hull = ConvexHull(points.detach().numpy())
     except QhullError:

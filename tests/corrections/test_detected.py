@@ -19,7 +19,7 @@ from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Reject
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import pack_known, unpack_known
+from mvseg.pipeline.before_edits import MOST_BYTES, pack_known, unpack_known
 from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -84,6 +84,7 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
         assert now.kept is not None
         now.kept.update({"surface": LEAVES[1], "edge": REGIONS.crop(0).numpy()})
         content = pack_known(find_in_photos(opened), ["odd"])
+        assert content is not None
     with running(keep=True) as now:
         found = unpack_known(content, opened)
         assert found is not None
@@ -101,7 +102,8 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     assert unpack_known(content, fewer) is None
     code = io.BytesIO()
     torch.save({"views": opened.names, "known": run}, code)
-    for broken in (b"", content[:-9], zlib.compress(b"text"), zlib.compress(code.getvalue())):
+    bomb = zlib.compress(bytes(MOST_BYTES + 1) + content)
+    for broken in (b"", content[:-9], bomb, zlib.compress(b"text"), zlib.compress(code.getvalue())):
         assert unpack_known(broken, opened) is None
 
 

@@ -48,13 +48,30 @@ def test_glb_has_a_node_per_mesh(ball: trimesh.Trimesh, tmp_path: Path) -> None:
     for name, color in (("leaf_001", RED), ("leaf_012", BLUE)):
         pose, geometry = scene.graph[name]
         back = scene.geometry[geometry]
-        np.testing.assert_array_equal(pose, np.eye(4))
-        np.testing.assert_allclose(back.bounds, meshes[name].bounds, rtol=1e-6)
+        np.testing.assert_allclose(back.bounds + pose[:3, 3], meshes[name].bounds, rtol=1e-6)
         assert back.is_watertight
         material = back.visual.material
         light = [int(255 * (value / 255) ** 2.2) for value in color]  # of sRGB, nearly
         np.testing.assert_allclose(material.baseColorFactor, [*light, 255], atol=2)
         assert (material.doubleSided, material.metallicFactor) == (True, 0)
+
+
+def test_meshes_stay_whole_far_from_the_origin(tmp_path: Path) -> None:
+    """1e7 away, with 32 bits, a leaf of this size would be a few points."""
+    leaf, far = bent_blade(length=0.03).mesh(), np.array([1e7, -1e7, 800.0])
+    moved = trimesh.Trimesh(leaf.vertices + far, leaf.faces, process=False)
+    write_ply(tmp_path / "leaf.ply", moved, RED, instance_id=1)
+    back = trimesh.load_mesh(tmp_path / "leaf.ply")
+    np.testing.assert_allclose(back.vertices - far, leaf.vertices, atol=1e-8)
+    turn = np.diag([2.0, 2, 2, 1])
+    write_glb(tmp_path / "scene.glb", {"leaf_001": moved}, {"leaf_001": RED}, matrix=turn)
+    scene = trimesh.load_scene(tmp_path / "scene.glb")
+    pose, geometry = scene.graph["leaf_001"]
+    assert scene.geometry[geometry].area == pytest.approx(leaf.area, rel=1e-6)
+    np.testing.assert_allclose(trimesh.transform_points(scene.geometry[geometry].vertices, pose) / 2 - far,
+                               leaf.vertices, atol=1e-8)  # fmt: skip
+    few, few_moved = simplify_mesh(leaf, 300), simplify_mesh(moved, 300)
+    assert few_moved.area == pytest.approx(few.area, rel=1e-3)
 
 
 def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
@@ -63,7 +80,7 @@ def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path)
 
 
 def test_glb_places_the_world_and_says_what_was_measured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
-    """Coordinates in the file stay the world's; the node above them turns z up to y and millimetres to metres."""
+    """Vertices are about the middle of all; the node above turns z up to y and millimetres to metres."""
     matrix = np.array([[0.001, 0, 0, 0], [0, 0, 0.001, 0], [0, -0.001, 0, 0], [0, 0, 0, 1]])
     path, said = tmp_path / "scene.glb", {"leaf": 1, "traits": {"area": 12.5}}
     more = {"about": {"unit": "mm"}, "extras": {"leaf_001": said}}
@@ -73,13 +90,15 @@ def test_glb_places_the_world_and_says_what_was_measured(ball: trimesh.Trimesh, 
     header = json.loads(content[20 : 20 + length])
     root = header["nodes"][header["scenes"][0]["nodes"][0]]
     assert (root["extras"], len(header["scenes"][0]["nodes"])) == ({"unit": "mm"}, 1)
-    np.testing.assert_allclose(np.reshape(root["matrix"], (4, 4)).T, matrix)  # glTF's matrices are column-major
+    moved, middle = np.eye(4), ball.bounds.mean(0)
+    moved[:3, 3] = middle
+    np.testing.assert_allclose(np.reshape(root["matrix"], (4, 4)).T, matrix @ moved)  # glTF's are column-major
     (leaf,) = (header["nodes"][child] for child in root["children"])
     assert (leaf["name"], leaf["extras"]) == ("leaf_001", said)
     (primitive,) = header["meshes"][leaf["mesh"]]["primitives"]
     assert primitive["attributes"].keys() == {"POSITION", "NORMAL"}
     bounds = header["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_allclose([bounds["min"], bounds["max"]], ball.bounds, rtol=1e-6)
+    np.testing.assert_allclose([bounds["min"], bounds["max"]] + middle, ball.bounds, rtol=1e-6)
     placed = trimesh.load_scene(path)
     np.testing.assert_allclose(placed.bounds, [[0.095, -0.002, 0.015], [0.105, 0.008, 0.025]], atol=3e-4)
 

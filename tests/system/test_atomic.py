@@ -213,6 +213,20 @@ def replace_files(place: Path) -> None:
         (folder / "new" / "c").write_text("2")
 
 
+def replace_files_until(place: Path, last: int) -> None:
+    """End the process, as a kill does, before the move of this number; after it, if there are fewer."""
+    replace, moves = os.replace, iter(range(100))
+
+    def move(source: Path, target: Path) -> None:
+        if next(moves) == last:
+            os._exit(1)
+        replace(source, target)
+
+    os.replace = move
+    replace_files(place)
+    os._exit(0)
+
+
 def contents(place: Path) -> dict[str, str]:
     return {path.relative_to(place).as_posix(): path.read_text() for path in place.rglob("*") if path.is_file()}
 
@@ -228,10 +242,7 @@ def test_files_of_a_folder_are_all_old_or_all_new_wherever_a_process_is_killed(t
         (place / "empty").mkdir(exist_ok=True)
         process = os.fork()
         if not process:
-            replace, steps = os.replace, iter(range(100))
-            atomic.os.replace = lambda *names: os._exit(1) if next(steps) == step else replace(*names)
-            replace_files(place)
-            os._exit(0)
+            replace_files_until(place, step)
         is_killed = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
         sweep_abandoned(place)
         left = contents(place)

@@ -44,6 +44,20 @@ def test_it_agrees_with_meshes() -> None:
     assert 0.5 < share < 0.95
 
 
+def test_numbers_and_deviations_do_not_depend_on_the_worlds_origin() -> None:
+    leaves = some_leaves()
+    far = {i: move(leaf, np.eye(3), shift=(1e7, -1e7, 1e7)) for i, leaf in leaves.items()}
+    for name, number in measure(leaves).items():
+        moved = measure(far)[name]
+        assert moved.value == pytest.approx(number.value, rel=1e-6), name
+        assert moved.sd == pytest.approx(number.sd, rel=1e-4, nan_ok=True), name
+    for i, leaf in leaves.items():
+        moved_leaf = measure_leaf(far[i], FRAME, ground=1e7)
+        for name, number in measure_leaf(leaf, FRAME).items():
+            assert moved_leaf[name].value == pytest.approx(number.value, rel=1e-6, abs=1e-6, nan_ok=True), name
+            assert moved_leaf[name].sd == pytest.approx(number.sd, rel=1e-4, abs=1e-9, nan_ok=True), name
+
+
 @pytest.mark.parametrize("seed", [15, 51])  # of 60 leaves, two of the four for which this was 1 + 4e-16
 def test_flat_leaves_side_by_side_intercept_no_more_than_all_light(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -15,6 +15,7 @@ from torch import Tensor
 from mvseg.crop import Crop
 from mvseg.reconstruction.numbers import DOUBTS, FIT
 from mvseg.reconstruction.surface.leaf_patch import (
+    MIDRIB,
     NUM_COEFFICIENTS,
     Floats,
     grid_triangles,
@@ -133,13 +134,15 @@ class LeafSurface:
         """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
 
         Args:
-            measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It must be
-                smooth at `coefficients`: an angle must not jump by 360 degrees, nor be folded back where it meets 0.
+            measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It gets the
+                surface moved to the origin, and must be smooth there: an angle must not jump by 360 degrees, nor be
+                folded back where it meets 0.
 
         Returns:
             (T,) float64; NaN without a surface, and for numbers that are NaN.
         """
-        center = self.coefficients.numpy()
+        center = self.coefficients.numpy().copy()
+        center[MIDRIB] -= center[MIDRIB].mean(0)  # neither step nor rounding depend on where the world's origin is
         step = FIT.difference * float(np.linalg.norm(center.std(axis=0)))
         moves = step * np.eye(center.size).reshape(-1, *center.shape)
         with np.errstate(all="ignore"):
