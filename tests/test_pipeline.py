@@ -40,13 +40,14 @@ from mvseg.formats.scene_folder import read_masks
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.pipeline.finish import finish
+from mvseg.pipeline.finish import finish, shape_leaves
 from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
 from mvseg.system.file_hash import hash_files
@@ -320,6 +321,26 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
     whole = [ids[0], *ids[2:]]
     left = [number for number in (1, 2, 3) if number not in ids[:2]]
     assert fits == ([(whole, []), (ids, left)] if is_checked else [(ids, [])])
+
+
+def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
+    plant: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    starts = {number: LeafSurface.none(torch.arange(2), f"start of {number}") for number in (2, 3)}
+    asked: list[dict[int, str]] = []
+
+    def fit(_: object, ids: torch.Tensor, *__: object, starts: Any, **___: object) -> dict[int, LeafSurface]:
+        asked.append({number: each.quality.reasons[0] for number, each in starts.items()})
+        return {}
+
+    def join(masks: Masks, *_: object, **__: object) -> Masks:
+        return replace(masks, instance_ids=masks.instance_ids.where(masks.instance_ids != 1, 2))
+
+    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", join)
+    known = match_given(open_scene(plant, plant / "masks", RunConfig(split_merged=True)))
+    shape_leaves(replace(known, instances=Instances(starts=starts)))
+    assert asked == [{2: "start of 2", 3: "start of 3"}, {1: "start of 2", 2: "start of 3"}]
 
 
 @pytest.mark.parametrize("verifies", [True, False])

@@ -58,7 +58,7 @@ def shape_leaves(known: Known) -> Result:
         with timed("check_ids"):
             checked = check_ids(known.masks, fitted, cameras=known.scene.cameras, config=config.match)
         num_moved = int((known.masks.instance_ids != checked.instance_ids).sum())
-        known = known.with_masks(split_merged(checked.close_gaps()) if config.split_merged else checked)
+        known = known.with_masks(split_merged(checked) if config.split_merged else checked)
     has_surfaces = config.reconstruct is not None and config.reconstruct.shape != "voxels"
     surfaces = _fit_surfaces(known) if has_surfaces else None
     shown = surfaces or known.instances.starts

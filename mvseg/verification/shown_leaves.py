@@ -119,7 +119,8 @@ def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
     odds = np.round(shows_features(candidates, evidence) @ list(fitted.shows.values()), CHOICE.digits)
     is_near = ~np.isnan(candidates.matched) | (candidates.is_credible & (evidence.claimed > 0))
     odds[~is_near | ~same_class(candidates, masks)] = -np.inf
-    odds[candidates.certain.any(1)] = -np.inf
+    is_apart = masks.is_linked.numpy() & (question.leaf < 0)  # the user only says which leaf they do not show
+    odds[candidates.certain.any(1) | is_apart] = -np.inf
     odds[candidates.certain] = np.inf
     return np.column_stack((odds, np.zeros(len(masks))))
 

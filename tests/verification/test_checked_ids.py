@@ -186,6 +186,20 @@ def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(s
     assert torch.equal(checked.instance_ids, ids)
 
 
+@pytest.mark.parametrize("is_linked", [True, False])
+def test_a_mask_that_the_user_keeps_apart_from_a_leaf_does_not_return_to_it(
+    is_linked: bool, scene: tuple[Regions, Tensor]
+) -> None:
+    """"different": the matcher then matches it to nothing, but its leaf's surface is where it is."""
+    regions, ids = scene
+    wrong, row = ids.clone(), place_of(regions, ids, 4, 2)
+    wrong[row] = -1
+    masks = matched(regions, wrong).masks
+    masks = replace(masks, is_linked=(torch.arange(len(ids)) == row) & is_linked)
+    checked = check_ids(masks, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.instance_ids, wrong if is_linked else ids)
+
+
 def test_a_mask_does_not_go_where_another_fits_as_well(scene: tuple[Regions, Tensor]) -> None:
     """Two masks of the same pixels, one of them matched to a leaf far away."""
     regions, ids = scene

@@ -134,8 +134,8 @@ class LeafSurface:
         """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
 
         Args:
-            measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It gets the
-                surface moved to the origin, and must be smooth there: an angle must not jump by 360 degrees, nor be
+            measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It gets
+                the surface moved to the origin, and must be smooth there: an angle must not jump by 360 degrees, nor be
                 folded back where it meets 0.
 
         Returns:
