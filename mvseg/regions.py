@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 import torch
@@ -103,6 +104,24 @@ class Regions:
         """The crop of one region, with its box."""
         x1, y1, x2, y2 = self.boxes[index].tolist()
         return Crop((x1, y1, x2, y2), self.crop(index))
+
+    def overlaps(self) -> list[tuple[int, int, int]]:
+        """The pairs of regions of one view that share pixels: the earlier one, the later one, and how many."""
+        found: list[tuple[int, int, int]] = []
+        views, boxes = self.view_index.cpu().numpy(), self.boxes.cpu().numpy()
+        crops = [self.crop(row).cpu().numpy() for row in range(len(self))]
+        for view in np.unique(views).tolist():
+            rows = np.flatnonzero(views == view).tolist()
+            counts = np.zeros(boxes[rows, 3:1:-1].max(0), np.int32)  # how many show each pixel
+            for row in rows:
+                counts[_slices(boxes[row])] += crops[row]
+            rows = [row for row in rows if (counts[_slices(boxes[row])][crops[row]] > 1).any()]
+            for one, other in combinations(rows, 2):
+                box = np.concatenate((np.maximum(*boxes[[one, other], :2]), np.minimum(*boxes[[one, other], 2:])))
+                parts = [crops[row][_slices(box - np.tile(boxes[row, :2], 2))] for row in (one, other)]
+                if (box[:2] < box[2:]).all() and (shared := int(np.count_nonzero(parts[0] & parts[1]))):
+                    found.append((one, other, shared))
+        return found
 
     def at(self, view: int, x: int, y: int) -> list[int]:
         """The regions of a view that show the pixel in column x, row y, ascending; none outside of the image."""
@@ -293,6 +312,12 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
             crops.append(torch.from_numpy(label_map[y1:y2, x1:x2] == number).flatten())
             labels.append(number)
     return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
+
+
+def _slices(box: np.ndarray) -> tuple[slice, slice]:
+    """Rows and columns of a box (4,)."""
+    x1, y1, x2, y2 = box.tolist()
+    return slice(y1, y2), slice(x1, x2)
 
 
 def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:

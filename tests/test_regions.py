@@ -7,6 +7,7 @@ import pytest
 import torch
 import torchvision
 
+from mvseg import regions_from_masks
 from mvseg.errors import InputError
 from mvseg.matching.samples import view_runs
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, masks_to_boxes, regions_from_label_maps
@@ -207,3 +208,17 @@ def test_label_maps_are_not_kept() -> None:
     regions = regions_from_label_maps(draw(view) for view in range(6))
     assert regions.num_views == len(regions) == 6
     assert regions_from_label_maps([]).num_views == 0
+
+
+def test_overlaps_are_those_of_whole_frames() -> None:
+    rng = np.random.default_rng(0)
+    masks = np.zeros((2, 6, 20, 30), bool)
+    for mask in masks.reshape(-1, 20, 30):
+        y, x, h, w = rng.integers((0, 0, 2, 2), (14, 22, 9, 12))
+        mask[y : y + h, x : x + w] = rng.random((min(h, 20 - y), min(w, 30 - x))) < 0.8
+    regions = regions_from_masks(list(masks))
+    pairs = [(v, i, j) for v in range(2) for i in range(6) for j in range(i + 1, 6)]
+    slow = [(6 * v + i, 6 * v + j, int((masks[v, i] & masks[v, j]).sum())) for v, i, j in pairs]
+    assert regions.overlaps() == [each for each in slow if each[2]]
+    assert len(regions.overlaps()) > 3
+    assert regions.select(torch.arange(0)).overlaps() == []

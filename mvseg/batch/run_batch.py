@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -126,7 +126,7 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
     """Run all scenes in parallel, first those that teach the detector; then those whose worker died once more, one at a
-    time, when memory is free again."""
+    time, when memory is free again. Where a teacher fails, the next scene of its species teaches."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
     running: dict[int, str] = {}  # in the order in which they began
@@ -140,13 +140,18 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
         show()
 
     def rounds() -> Iterator[tuple[bool, dict[int, BatchScene]]]:
-        numbered = dict(enumerate(scenes))
-        taught = {index: scene for index, scene in numbered.items() if scene.teacher is not None}
-        yield False, {index: scene for index, scene in numbered.items() if index not in taught}
-        if taught:
-            yield False, taught
+        waiting, asked = dict(enumerate(scenes)), dict(enumerate(scenes))
+        while waiting:
+            done = {scenes[index].name for index, each in finished.items() if each.status.state == "done"}
+            now = {index: each for index, each in waiting.items() if each.teacher is None or each.teacher in done}
+            if not now:
+                waiting = _replace_teachers(waiting)
+            else:
+                waiting = {index: each for index, each in waiting.items() if index not in now}
+                asked |= now
+                yield False, now
         for index in again:
-            yield True, {index: scenes[index]}
+            yield True, {index: asked[index]}
 
     with progress_bar(total=len(scenes), name="batch", unit="scene") as bar:
         for is_last, items in rounds():
@@ -167,6 +172,19 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
                 for index in running:  # killed workers did not clean up
                     sweep_abandoned(out / scenes[index].name)
     return finished
+
+
+def _replace_teachers(waiting: Mapping[int, BatchScene]) -> dict[int, BatchScene]:
+    """The same scenes, whose teachers have failed; the first of those that each had now teaches the others."""
+    first: dict[str | None, str] = {}
+    for scene in waiting.values():
+        if first.setdefault(scene.teacher, scene.name) == scene.name:
+            _say(f"{scene.teacher}: failed, so that it teaches no other plant; {scene.name} teaches in its place")
+    teachers = {index: first[scene.teacher] for index, scene in waiting.items()}
+    return {
+        index: replace(scene, teacher=None if teachers[index] == scene.name else teachers[index])
+        for index, scene in waiting.items()
+    }
 
 
 def _say(text: str) -> None:

@@ -16,6 +16,7 @@ from mvseg.formats.text_file import read_table
 from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks", "corrections")
+KNOWN_COLUMNS = (*OWN_COLUMNS, "plant", "time", "species")  # in any case
 # of summary.csv, behind those of the scene
 SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
 RESERVED = {STATE, TABLES}
@@ -52,7 +53,7 @@ def with_teachers(scenes: Sequence[BatchScene]) -> tuple[BatchScene, ...]:
     first: dict[str, str] = {}
     taught = []
     for scene in scenes:
-        species = scene.carried.get("species", "")
+        species = scene.carried.get("species", "").casefold()
         teacher = None if scene.masks is not None else first.setdefault(species, scene.name)
         taught.append(replace(scene, teacher=None if teacher == scene.name else teacher))
     return tuple(taught)
@@ -143,6 +144,7 @@ def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     if not rows:
         raise InputError(f"{source}: is empty, expected a table with a column 'scene'")
     (_, columns), *rows = rows
+    columns = [column.lower() if column.lower() in KNOWN_COLUMNS else column for column in columns]
     _check_columns(source, columns)
     if not rows:
         raise InputError(f"{source}: names no scenes, expected one row per scene")

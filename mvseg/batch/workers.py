@@ -8,13 +8,14 @@ they need the same mvseg, and the same paths to scenes and results: a shared dis
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import threading
 import uuid
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -143,6 +144,7 @@ def connect(scheduler: str) -> Client:
     host, _, port = scheduler.rpartition(":")
     is_address = "://" in scheduler or (host and port.isdigit() and not Path(scheduler).exists())
     address = scheduler if is_address else _read_scheduler_file(Path(scheduler))
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it logs with traces, is said in one sentence
     try:
         return Client(address, timeout=TIMEOUT, name="mvseg")
     except (OSError, ValueError) as error:
@@ -167,26 +169,46 @@ def run_on_dask(
     When a worker dies, the scheduler gives its items to others, up to `allowed-failures` times; then they are lost.
     When the iterator is closed early, items that no worker has started are cancelled; workers finish those that they
     have started.
+
+    Raises:
+        InputError: a worker lacks mvseg, or the scheduler does not answer any more.
     """
     from distributed import as_completed
 
-    client.register_plugin(_build_plugin(), name="mvseg")
+    try:
+        client.register_plugin(_build_plugin(), name="mvseg")
+    except Exception as error:  # whatever a worker answers
+        _refuse_lost(client, error)
+        found = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        raise InputError(f"a Dask worker cannot run mvseg ({found}), expected the same mvseg on all workers") from None
     batch, key_of = uuid.uuid4().hex[:8], {}
     try:
         for key, item in items.items():
             key_of[client.submit(work, item, key=f"mvseg-{batch}-{key}", pure=False)] = key
             started(key)
         for future in as_completed(list(key_of), loop=client.loop):
-            answer = _read_answer(future)
+            answer = _read_answer(future, client)
             yield key_of.pop(future), answer
+    except (OSError, CancelledError) as error:
+        _refuse_lost(client, error)
+        raise
     finally:
-        client.cancel(list(key_of))
+        with suppress(OSError):  # the scheduler is gone
+            client.cancel(list(key_of))
 
 
-def _read_answer(future: Any) -> Any:
+def _refuse_lost(client: Client, error: BaseException) -> None:
+    """Raise InputError if it is the scheduler that does not answer any more."""
+    if isinstance(error, OSError) or client.status != "running":
+        what = "the Dask scheduler does not answer any more"
+        raise InputError(f"{what}: start it again, and then this command with --resume true") from None
+
+
+def _read_answer(future: Any, client: Client) -> Any:
     try:
         error = future.exception()
     except CancelledError as cancelled:
+        _refuse_lost(client, cancelled)
         error = cancelled
     if error is None:
         return future.result()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
@@ -67,10 +68,28 @@ def find_views(names: Sequence[str], scene: PhotoSet, *, source: Path, warn_of_l
 def base_name(name: str) -> str:
     """A file name without folders, the suffixes of images, Roboflow's ending and Label Studio's prefix, in small
     letters."""
-    last = name.replace("\\", "/").rsplit("/", 1)[-1]
+    last = composed(name).replace("\\", "/").rsplit("/", 1)[-1]
     while "." in last and f".{last.rsplit('.', 1)[1].lower()}" in PHOTO_SUFFIXES:
         last = last.rsplit(".", 1)[0]
     return LABEL_STUDIO.sub("", ROBOFLOW.sub("", last)).lower()
+
+
+def composed(name: str) -> str:
+    """A name in Unicode's composed form: macOS decomposes the umlauts of file names, other systems do not."""
+    return unicodedata.normalize("NFC", name)
+
+
+def find_file(path: Path) -> Path:
+    """The file of a name, or else one beside it whose name differs in Unicode's form only; the path itself, if there is
+    none."""
+    if str(path).isascii() or path.exists():
+        return path
+    place = Path(path.anchor)
+    for part in path.parts[len(place.parts) :]:
+        if not (place / part).exists() and place.is_dir():
+            part = next((each.name for each in place.iterdir() if composed(each.name) == composed(part)), part)
+        place /= part
+    return place if place.exists() else path
 
 
 def list_some(names: Sequence[str]) -> str:
@@ -96,15 +115,15 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 
 def _exact_views(names: Sequence[str], scene: PhotoSet, source: Path) -> list[int | None]:
     """The view of each name by its path or its name, None if neither matches."""
-    by_name = {view.name: index for index, view in enumerate(scene.views)}
+    by_name = {composed(view.name): index for index, view in enumerate(scene.views)}
     by_path: dict[str, list[int]] = defaultdict(list)
     for index, view in enumerate(scene.views):
-        parts = view.path.as_posix().split("/")
+        parts = composed(view.path.as_posix()).split("/")
         for start in range(len(parts)):
             by_path["/".join(parts[start:])].append(index)
     found: list[int | None] = []
     for file_name in names:
-        name = file_name.replace("\\", "/").removeprefix("./")
+        name = composed(file_name).replace("\\", "/").removeprefix("./")
         stem = name.rsplit(".", 1)[0]
         same_name = by_name.get(name, by_name.get(stem))
         fitting = [] if same_name is not None else by_path.get(name) or by_path.get(stem, [])

@@ -103,7 +103,8 @@ def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
     except Exception:  # Pillow raises almost anything on a damaged file
         raise InputError(f"{path}: cannot be read, expected a whole image: its list of pages is damaged") from None
     if num_pages > 1:
-        raise InputError(f"{path}: holds {num_pages} pages, expected a single label image")
+        mend = "number its masks in one page, or save the stack as .npy"
+        raise InputError(f"{path}: holds {num_pages} pages, expected one label image: {mend}")
     if image.mode in ("RGB", "RGBA"):
         return _number_colours(path, image, read_deep(path, image))
     if image.mode in ("I", "F"):
@@ -136,7 +137,8 @@ def labels_of_numbers(path: Path, numbers: np.ndarray) -> np.ndarray:
     if not np.issubdtype(numbers.dtype, np.number) or np.issubdtype(numbers.dtype, np.complexfloating):
         raise InputError(f"{path}: holds {numbers.dtype}, expected whole numbers")
     if not np.isfinite(numbers).all() or (numbers < 0).any() or (numbers != np.floor(numbers)).any():
-        raise InputError(f"{path}: holds numbers that are no labels, expected whole numbers from 0")
+        mend = "; if -1 is the background, add 1" if np.isfinite(numbers).all() and numbers.min() == -1 else ""
+        raise InputError(f"{path}: holds numbers that are no labels, expected whole numbers from 0{mend}")
     if numbers.max(initial=0) <= IGNORE_LABEL:
         return numbers.astype(np.uint16)
     distinct, indices = np.unique(numbers, return_inverse=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from mvseg.errors import InputError, check_arguments, collect_warnings, warn
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
-from mvseg.formats.find_views import list_some
+from mvseg.formats.find_views import find_file, list_some
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
@@ -45,10 +46,16 @@ def load_scene(folder: Path | str) -> Scene:
     Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP). Another program's `cameras.json`
     is left out where another of these is there, which an InputWarning says.
 
+    Names of photos may be composed or decomposed Unicode (macOS), whatever the files' are.
+
     Raises:
         InputError: the folder is missing or holds no cameras, or they are not sound; see the readers.
     """
-    folder = Path(folder)
+    scene = _read_cameras(Path(folder))
+    return replace(scene, views=tuple(replace(view, path=find_file(view.path)) for view in scene.views))
+
+
+def _read_cameras(folder: Path) -> Scene:
     if not folder.is_dir():
         problem = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
         raise InputError(f"{folder}: {problem}")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +39,12 @@ def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
     Raises:
         InputError: as `read_bytes`, or it is not UTF-8.
     """
+    return _decode(read_bytes(path, expected, most=most), path, expected)
+
+
+def _decode(data: bytes, path: Path, expected: str) -> str:
     try:
-        return read_bytes(path, expected, most=most).decode("utf-8-sig")
+        return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start} is not UTF-8, expected {expected}") from None
 
@@ -47,17 +53,29 @@ def read_table(path: Path, expected: str, *, most: int = MAX_TABLE) -> list[tupl
     """The rows of a CSV file that are not empty, the header first: number of the line, and cells without space around
     them. Cells are separated by commas, semicolons or tabs, whichever the header has most of.
 
+    As Excel writes it, too: UTF-16, a first line "sep=;", and cells without content at the ends of all lines.
+
     Raises:
         InputError: as `read_text`, or it is not CSV.
     """
-    text = read_text(path, expected, most=most)
-    delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    data = read_bytes(path, expected, most=most)
+    is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    try:
+        text = data.decode("utf-16") if is_wide else _decode(data, path, expected)
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: begins as UTF-16 and is not, expected {expected}") from None
+    stated = re.match(r'"?sep=([,;\t])"?\r?\n', text)
+    text = "\n" * bool(stated) + text[stated.end() if stated else 0 :]  # the numbers of its lines stay
+    delimiter = stated[1] if stated else max(",;\t", key=text.partition("\n")[0].count)
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
     try:
         rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
     except csv.Error as error:
         raise InputError(f"{path}: line {reader.line_num} is not CSV ({error})") from None
-    return [(line, cells) for line, cells in rows if any(cells)]
+    rows = [(line, cells) for line, cells in rows if any(cells)]
+    width = max((number for _, cells in rows for number, cell in enumerate(cells, start=1) if cell), default=0)
+    named = len(rows[0][1]) if rows else 0
+    return [(line, cells[: max(width, 1)] if len(cells) == named else cells) for line, cells in rows]
 
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:

@@ -100,6 +100,37 @@ def test_a_scheduler_that_is_not_there(
     assert str(error.value).startswith(message)
 
 
+class Cluster:
+    """What `run_on_dask` asks of a client, with faults."""
+
+    def __init__(self, *, at_once: Exception | None = None, later: BaseException | None = None) -> None:
+        self.at_once, self.later, self.status, self.loop = at_once, later, "running", None
+
+    def register_plugin(self, *_: object, **__: object) -> None:
+        if self.at_once is not None:
+            raise self.at_once
+
+    def submit(self, *_: object, **__: object) -> Any:
+        assert self.later is not None
+        raise self.later
+
+    def cancel(self, _: object) -> None:
+        raise OSError("closed")
+
+
+@pytest.mark.parametrize(
+    ("client", "message"),
+    [
+        (Cluster(at_once=ModuleNotFoundError("No module named 'mvseg'")), "a Dask worker cannot run mvseg .*No module"),
+        (Cluster(at_once=OSError("Timed out")), "the Dask scheduler does not answer any more: start it again"),
+        (Cluster(later=OSError("Comm is closed")), "the Dask scheduler does not answer any more: start it again"),
+    ],
+)
+def test_a_cluster_that_cannot_work_is_one_sentence(client: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        list(run_on_dask(do_as_told, {0: "a"}, int, client=client))
+
+
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"^--scheduler needs distributed: pip install 'mvseg\[batch\]'$"):

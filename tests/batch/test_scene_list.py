@@ -53,6 +53,11 @@ def test_tables_with_semicolons_and_names(tmp_path: Path) -> None:
     assert scenes[0].carried == {"plant": "first", "time": "", "height": "1,5"}
 
 
+def test_names_of_columns_in_any_case(tmp_path: Path) -> None:
+    (scene,) = list_scenes(write(tmp_path, "Scene,Plant,Species,Genotype,\na,b,Fig,X,\n"), OUT, None)
+    assert scene.carried == {"plant": "b", "time": "", "species": "Fig", "Genotype": "X"}
+
+
 def test_every_sub_folder_is_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("mint", "basil", ".git", "results"):
         (tmp_path / name).mkdir()

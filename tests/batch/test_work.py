@@ -225,7 +225,7 @@ def test_the_first_plant_of_a_species_teaches_the_others(scene: BatchScene, tmp_
     table = [
         replace(plain, name=name, carried={"species": species}, masks=masks)
         for name, species, masks in (
-            ("a", "fig", Path("masks")), ("b", "fig", None), ("c", "ivy", None), ("d", "fig", None), ("e", "ivy", None)
+            ("a", "fig", Path("masks")), ("b", "fig", None), ("c", "ivy", None), ("d", "Fig", None), ("e", "ivy", None)
         )
     ]  # fmt: skip
     taught = with_teachers(table)

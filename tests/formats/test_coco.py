@@ -183,7 +183,7 @@ def test_masks_of_many_photos_are_never_in_memory_together(tmp_path: Path) -> No
     scene = Scene("plant", scene.views, replace(scene.cameras, sizes=torch.tensor([[side, side]] * len(scene.views))))
     masks = np.zeros((per_view, side, side), bool)
     for number, mask in enumerate(masks):
-        mask[400 + number : 450 + number, 300:350] = True
+        mask[400 + 60 * number : 450 + 60 * number, 300:350] = True
     images = [{"id": view, "file_name": f"{view}.jpg", "width": side, "height": side} for view in range(8)]
     rles = [encode_mask(mask) for mask in masks]
     annotations = [{"image_id": view, "segmentation": rle} for view in range(8) for rle in rles]
@@ -339,6 +339,22 @@ def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
     write(tmp_path, [{"segmentation": [POLYGON], "image_id": each} for each in (10, 12)], ("a.jpg", "b.jpg", "a.jpg"))
     with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are of one photo, and both have annot"):
         read_all(path, scene)
+
+
+def test_what_nearly_stands_twice_and_what_stands_in_each_other(scene: Scene, tmp_path: Path) -> None:
+    moved = [[x + 0.4 for x in POLYGON]]
+    path = write(tmp_path, [{"segmentation": each} for each in ([POLYGON], [OTHER], moved)])
+    with pytest.warns(InputWarning) as said:
+        regions = load_masks(scene, path)
+    assert regions.labels.tolist() == [1, 2]
+    assert "1 of 3 masks are nearly another mask of their photo" in str(said[0].message)
+    assert not any("lie inside" in str(each.message) for each in said)
+    part = [10.0, 10.0, 14.0, 10.0, 14.0, 14.0]
+    whole = [1.0, 1.0, 40.0, 1.0, 40.0, 39.0, 1.0, 39.0]
+    path = write(tmp_path, [{"segmentation": [each]} for each in (whole, part)])
+    with pytest.warns(InputWarning) as said:
+        assert load_masks(scene, path).labels.tolist() == [1, 2]
+    assert any("1 of 2 masks lie inside of other masks, in view 0" in str(each.message) for each in said)
 
 
 def test_masks_that_read_as_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:

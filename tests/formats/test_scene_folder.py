@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -162,3 +164,18 @@ def test_missing_masks_are_named(tmp_path: Path) -> None:
     for place in ("absent", "cameras.txt", "absent.json"):
         with pytest.raises(InputError, match=f"{place}: no such masks, expected a folder of label PNGs or a COCO"):
             load_masks(scene, folder / place)
+
+
+@pytest.mark.parametrize("form", ["NFC", "NFD"])
+def test_names_of_photos_and_masks_in_the_other_form_of_unicode(form: Literal["NFC", "NFD"], tmp_path: Path) -> None:
+    """A zip of a Mac decomposes umlauts; the cameras have them composed, or the other way round."""
+    plant = write_scene(tmp_path / "plant", num_views=2)
+    other: Literal["NFC", "NFD"] = "NFD" if form == "NFC" else "NFC"
+    for view in range(2):
+        edit_rig(plant, view, file=f"images/{unicodedata.normalize(form, 'Kübel')}_{view}.png")
+        for folder in ("images", "masks"):
+            path = plant / folder / f"{view:03d}.png"
+            path.rename(path.with_name(f"{unicodedata.normalize(other, 'Kübel')}_{view}.png"))
+    scene = load_scene(plant)
+    assert [view.path.is_file() for view in scene.views] == [True, True]
+    assert load_masks(scene, plant / "masks").num_per_view.tolist() == [3, 3]

@@ -50,6 +50,12 @@ def test_a_table_is_read_as_spreadsheets_and_editors_write_it(tmp_path: Path) ->
     assert read_table(path, "a table") == [(1, ["a", "b", "c"]), (4, ["1", "two\nlines, in one"]), (6, ["3", "4", "5"])]
     path.write_text("")
     assert read_table(path, "a table") == []
+    for encoding in ("utf-16", "utf-8-sig"):  # Excel's "Unicode text", and its "CSV UTF-8"
+        path.write_bytes("sep=;\r\nphoto;Höhe;;\r\na;1,5;;\r\nb;;;\r\n".encode(encoding))
+        assert read_table(path, "a table") == [(2, ["photo", "Höhe"]), (3, ["a", "1,5"]), (4, ["b", ""])]
+    path.write_bytes("photo\tx\n".encode("utf-16") + b"\x00")
+    with pytest.raises(InputError, match=r"table\.csv: begins as UTF-16 and is not, expected a table"):
+        read_table(path, "a table")
     path.write_bytes(b"a,b\n1,\xff\n")
     with pytest.raises(InputError, match=r"table\.csv: byte 6 is not UTF-8, expected a table"):
         read_table(path, "a table")

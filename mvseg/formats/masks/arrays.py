@@ -12,6 +12,7 @@ from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments, faults_of
 from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.masks.npy_masks import has_labels
 from mvseg.formats.masks.view_regions import ViewMasks, stack_views
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Scene
@@ -29,7 +30,8 @@ def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regi
     Args:
         views: one entry per view, in the order of the cameras, each of any of these forms:
             a NumPy array or tensor (N, H, W) or (N, 1, H, W), bool, integers (not 0 is mask) or floats (above 0.5);
-            one of whole numbers (H, W): 0 = nothing, 65535 = ignore, any other number = one mask;
+            one of whole numbers (H, W), or (1, H, W) with two numbers or more: 0 = nothing, 65535 = ignore, any other
+            number = one mask;
             a dict with such "masks" (torchvision's detectors, one per image);
             a list of dicts with a "segmentation" (H, W) bool or COCO's run lengths (SamAutomaticMaskGenerator);
             supervision.Detections with masks.
@@ -86,7 +88,7 @@ def with_instance_ids(views: Sequence[Any], regions: Regions, instance_ids: Tens
 
 def _give(view: Any, id_of: Mapping[int, int]) -> Any:
     if isinstance(view, (np.ndarray, Tensor)):
-        if view.ndim == 2:
+        if has_labels(_to_numpy(view)):
             numbers, indices = np.unique(_to_numpy(view), return_inverse=True)
             values = np.array([max(0, id_of.get(number, 0)) for number in numbers.tolist()], np.int64)
             ids = values[indices].reshape(view.shape)
@@ -113,8 +115,8 @@ def _read(view: Any, size: tuple[int, ...] | None) -> ViewMasks:
     if isinstance(view, Mapping) and "masks" in view:
         stack = list(_stack(_to_numpy(view["masks"])))
     elif isinstance(view, (np.ndarray, Tensor)):
-        if view.ndim == 2:
-            return _check_size(_labels(_to_numpy(view)), size)
+        if has_labels(_to_numpy(view)):
+            return _check_size(_labels(_to_numpy(view).reshape(view.shape[-2:])), size)
         stack = list(_stack(_to_numpy(view)))
     elif isinstance(view, Sequence) and all(isinstance(each, Mapping) and "segmentation" in each for each in view):
         stack = [_decode(each["segmentation"], size) for each in view]

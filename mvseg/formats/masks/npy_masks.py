@@ -1,4 +1,4 @@
-"""NumPy files: `.npy` with labels (H, W), or with a stack of masks (N, H, W). Nothing is ever unpickled."""
+"""NumPy files: `.npy` with labels (H, W) or (1, H, W), or with a stack of masks (N, H, W). Nothing is unpickled."""
 
 from __future__ import annotations
 
@@ -33,12 +33,23 @@ def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask
     if array.shape[-2:] != (height, width) or array.ndim not in (2, 3):
         shape = " x ".join(map(str, array.shape))
         expected = f"expected {height} x {width}, or N x {height} x {width}"
+        if array.shape[:2] == (height, width):
+            expected += ": np.moveaxis(masks, -1, 0) makes that of it"
         raise InputError(f"{path}: its shape is {shape or 'empty'}, {expected}")
-    if array.ndim == 2:
-        return labels_of_numbers(path, np.asarray(array, np.uint8) if array.dtype == bool else np.asarray(array))
+    if has_labels(array):
+        labels = np.asarray(array).reshape(height, width)
+        return labels_of_numbers(path, labels.astype(np.uint8) if labels.dtype == bool else labels)
     if array.dtype.kind not in "buif":
         raise InputError(f"{path}: holds a stack of {array.dtype}, expected masks of bool or whole numbers")
     return [FoundMask(number, _mask_of(path, np.asarray(mask))) for number, mask in enumerate(array, start=1)]
+
+
+def has_labels(array: np.ndarray) -> bool:
+    """Whether an array holds a label map: (H, W), or (1, H, W) with several numbers above 0, as models return it."""
+    if array.ndim != 3 or len(array) != 1 or array.dtype.kind not in "iu":
+        return array.ndim == 2
+    numbers = array[array > 0]
+    return bool(numbers.size and (numbers != numbers[0]).any())
 
 
 def _mask_of(path: Path, numbers: np.ndarray) -> np.ndarray:

@@ -200,6 +200,9 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
     if jsons:
         message = f"holds {len(jsons)} JSON files ({found}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
+    archive = next((path for path in paths if path.suffix.lower() == ".npz"), None)
+    if archive is not None:
+        raise InputError(f"{archive}: is an archive of arrays, expected one array: np.save writes it as .npy")
     jpeg = next((path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")), None)
     if jpeg is not None:
         raise InputError(f"{jpeg}: is a JPEG, which blurs the numbers of masks: export PNG instead")

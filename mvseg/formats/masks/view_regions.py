@@ -19,6 +19,7 @@ from mvseg.scene import Scene
 
 ViewMasks = np.ndarray | Iterable[tuple[int, np.ndarray]]
 Box = tuple[int, int, int, int]
+SAME = 0.75  # definition: IoU of two masks of one object; that of 20 x 8 pixels, moved by one along both sides, has it
 Cropped = tuple[int, Box | None, np.ndarray]  # number, box (None: no pixel), and the pixels (h, w) bool in the box
 
 
@@ -37,8 +38,8 @@ def stack_views(
 
     Returns:
         Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks that are left out: those
-        without pixels, empty or not shown by the undistorted photo, and those that stand twice in one view, pixel for
-        pixel; of what `check_numbers` finds in label maps; and of what `mask_faults` finds in masks of a scene.
+        without pixels, empty or not shown by the undistorted photo, and those that stand twice in one view, or nearly
+        (`SAME`); of what `check_numbers` finds in label maps; and of what `mask_faults` finds in masks of a scene.
 
     Raises:
         InputError: there are masks, and none has a pixel; or see `check_numbers`.
@@ -66,6 +67,7 @@ def stack_views(
     num_views = num_views or 0 if scene is None else len(scene.views)
     view_index, boxes, crops, labels = zip(*rows, strict=True) if rows else ((), (), (), ())
     regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
+    regions = _without_copies(regions, source=source)
     if between[0]:
         check_numbers(regions, between, source=source)
     if scene is not None and len(regions):  # without any, a run says so
@@ -92,6 +94,18 @@ def _crop_masks(
         shown = undistort(mask.view(np.uint8), lens, K).view(bool)
         x1, y1, x2, y2 = box = mask_box(torch.from_numpy(shown)) if shown.any() else (0, 0, 0, 0)
         yield label, box if x2 else None, shown[y1:y2, x1:x2]
+
+
+def _without_copies(regions: Regions, *, source: object) -> Regions:
+    """The regions without those that are nearly an earlier one of their view."""
+    is_copy, areas = torch.zeros(len(regions), dtype=torch.bool), regions.areas.tolist()
+    for one, other, shared in regions.overlaps():
+        if not is_copy[one] and shared >= SAME * (areas[one] + areas[other] - shared):
+            is_copy[other] = True
+    if is_copy.any():
+        what = f"{source}: {int(is_copy.sum())} of {len(regions)} masks are nearly another mask of their photo"
+        warn(f"{what} (IoU of {SAME} or more), and are left out")
+    return regions.select(~is_copy)
 
 
 def _say_left_out(num_kept: int, num_empty: int, num_twice: int, *, source: object) -> None:

@@ -166,3 +166,15 @@ def test_supervision_itself() -> None:
     if compact is not None:
         whole.mask = compact.from_dense(MASKS, whole.xyxy, (20, 30))
         assert torch.equal(regions_from_masks([whole]).crops, regions_from_masks([MASKS]).crops)
+
+
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_labels_with_a_first_axis_of_one_are_labels_and_get_ids_back(kind: Any) -> None:
+    labels = np.zeros((1, 20, 30), np.int32)
+    labels[0, 2:9, 3:12], labels[0, 10:12, 25:28] = 7, 4
+    views = [kind(labels), kind(labels)]
+    regions = regions_from_masks(views)
+    assert regions.labels.tolist() == [4, 7, 4, 7]
+    ids = with_instance_ids(views, regions, torch.tensor([1, 2, 1, 2]))
+    np.testing.assert_array_equal(ids[1], np.where(labels == 7, 2, np.where(labels == 4, 1, 0)))
+    assert regions_from_masks([kind(labels == 7), kind(labels == 7)]).labels.tolist() == [1, 1]

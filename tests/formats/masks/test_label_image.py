@@ -98,7 +98,7 @@ def test_no_labels(tmp_path: Path) -> None:
             read_label_image(tmp_path / f"{name}.tif", 1, 1)
     pages = [Image.new("L", (3, 3)) for _ in range(4)]
     pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
-    with pytest.raises(InputError, match=r"pages.tif: holds 4 pages, expected a single label image"):
+    with pytest.raises(InputError, match=r"pages.tif: holds 4 pages, expected one label image: number its masks"):
         read_label_image(tmp_path / "pages.tif", 3, 3)
     first = bytearray((tmp_path / "half.tif").read_bytes())
     at = int.from_bytes(first[4:8], "little")
