@@ -39,6 +39,7 @@ from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
+from mvseg.runs.recorded_run import read_recorded
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
@@ -646,6 +647,24 @@ def test_inputs_that_changed_or_moved_since(
     assert f"{photos}: 1 of 4 photos have changed since this result was made (001.png)." in said.err
     assert said.out.endswith("(in place of an earlier result)\n")
     assert OpenResult(elsewhere / "out").notice == ""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes")
+def test_a_strangers_result_makes_nobody_read_other_files(tmp_path: Path) -> None:
+    """A device has no end, and a pipe that nobody writes to never answers."""
+    scene, out = write_scene(tmp_path / "balls"), tmp_path / "out"
+    run_one_scene(scene, Path("masks"), out, config=RunConfig(reconstruct=None))
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "private.txt").write_text("mine")
+    run = json.loads((out / "run.json").read_text())
+    run["inputs"] |= {str(path): "0" for path in ("/dev/zero", tmp_path / "pipe", tmp_path / "private.txt", "/")}
+    run["photo_sha256"] |= {"../../private.txt": "0", "/dev/zero": "0"}
+    (out / "run.json").write_text(json.dumps(run))
+    changes = read_recorded(out).changes
+    assert f"{tmp_path / 'private.txt'}: is not looked at, since the run did not read it." in changes
+    assert "/: is not looked at, since the run did not read it." in changes
+    assert "/dev/zero: is gone since this result was made." in changes
+    assert any("2 of 6 photos are gone" in each for each in changes)
 
 
 def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:

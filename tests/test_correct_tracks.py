@@ -133,6 +133,7 @@ def test_tracks_that_cannot_be_corrected(folder: Path, capsys: pytest.CaptureFix
     for change, sentence in (
         ({"plants": []}, "an earlier version made these tracks"),
         ({"plants": [*plants, plants[0] | {"plant": "other"}]}, "holds 2 plants, expected one of tracks, other"),
+        ({"plants": [plants[0] | {"times": plants[0]["times"][1:]}]}, "1 times for 2 results, expected one for each"),
         ({"plants": [plants[0] | {"results": ["/nowhere/a", plants[0]["results"][1]]}]}, "/nowhere/a: the result that"),
     ):
         (folder / "run.json").write_text(json.dumps(said | {"config": said["config"] | change}))

@@ -33,6 +33,7 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.detection.detect_scene import detect_scene
+from mvseg.detectors.zoo import weights_path
 from mvseg.errors import warn
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
@@ -228,6 +229,18 @@ class TestDescribeRun:
         path = masks / "001.png"
         path.write_bytes(path.read_bytes() + b"\0")
         assert run_scene(plant, masks, IDS_ONLY).inputs[str(masks)] != first.inputs[str(masks)]
+
+    def test_weights_of_the_user_are_found_from_any_folder(
+        self, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        (tmp_path / "own.safetensors").touch()
+        result = run_scene(plant, plant / "masks", IDS_ONLY)
+        for stated, recorded in (("own.safetensors", str(tmp_path / "own.safetensors")), ("leaf-lite", "leaf-lite")):
+            run = describe_run(result, None, RunConfig(detect=DetectConfig(weights=stated)))
+            assert run["config"]["detect"]["weights"] == recorded
+        with pytest.raises(InputError, match=r"holds no detector.safetensors, expected a result whose"):
+            weights_path(tmp_path)
 
     def test_hashes_are_of_what_was_read(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         """Masks and cameras change while a run works; and while they are read."""

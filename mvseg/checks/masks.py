@@ -43,11 +43,18 @@ def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
         sizes = f"fewer than {IMAGES.tiny_px} pixels (median {np.median(areas):.0f})"
         what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
         rules.append(("warning", None, what))
-    cut = touches_border(regions, cameras).numpy()
-    if cut.mean() > IMAGES.many:
-        what = f"{cut.sum()} of {len(regions)} masks touch the border of their photo, and cut leaves come out small: "
-        rules.append(("warning", None, f"{what}step back, or add photos"))
+    if what := describe_cut(regions, cameras):
+        rules.append(("warning", None, what))
     return rules
+
+
+def describe_cut(regions: Regions, cameras: Cameras) -> str:
+    """The sentence about D masks that the borders of V photos cut, where they are many; "" elsewhere."""
+    cut = touches_border(regions, cameras)
+    if not len(regions) or float(cut.float().mean()) <= IMAGES.many:
+        return ""
+    what = f"{int(cut.sum())} of {len(regions)} masks touch the border of their photo, and cut leaves come out small"
+    return f"{what}: step back, or add photos"
 
 
 def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:

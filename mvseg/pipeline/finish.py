@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from mvseg.checks.check_scene import warn_of_contradictions
+from mvseg.checks.masks import describe_cut
 from mvseg.config import RunConfig
 from mvseg.corrections.settle import settle
 from mvseg.detection.numbers import DETECTION
@@ -37,7 +38,11 @@ def finish(known: Known) -> Result:
         has_photos = config.reconstruct is not None and known.opened.photos.exist
         photos = known.opened.photos if has_photos else None
         result = replace(result, contradictions=warn_of_contradictions(result.scene, result.regions, photos=photos))
-    return result if config.reconstruct is None else _measure(result, config, config.reconstruct)
+    if config.reconstruct is None:
+        return result
+    if cut := describe_cut(result.regions.to("cpu"), result.scene.cameras.to("cpu")):
+        warn(cut)
+    return _measure(result, config, config.reconstruct)
 
 
 def shape_leaves(known: Known) -> Result:

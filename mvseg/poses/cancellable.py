@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from threading import Event, Thread
 from typing import Any, TypeVar
 
@@ -30,17 +31,28 @@ def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> 
         finally:
             done.set()
 
-    thread, loglevel = Thread(target=run), pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(loglevel, 2)  # errors only: the log is for COLMAP's developers
-    try:
-        thread.start()
-        while not done.wait(0.1):  # seconds; not `join`: in Python 3.11 an exception in it takes the thread for ended
-            pass
-    finally:  # files that the call still writes are about to be deleted
-        token.cancel()
-        if thread.ident is not None:
-            done.wait()
-        pycolmap.logging.minloglevel = loglevel
+    thread = Thread(target=run)
+    with quiet_colmap():
+        try:
+            thread.start()
+            # seconds; not `join`: in Python 3.11 an exception in it takes the thread for ended
+            while not done.wait(0.1):
+                pass
+        finally:  # files that the call still writes are about to be deleted
+            token.cancel()
+            if thread.ident is not None:
+                done.wait()
     if errors:
         raise errors[0]
     return answers[0]
+
+
+@contextmanager
+def quiet_colmap() -> Iterator[None]:
+    """COLMAP logs errors only: its log is for its developers."""
+    loglevel = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(loglevel, 2)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = loglevel

@@ -1,4 +1,6 @@
-"""How sure a focal length is: it scales all depths and heights, and residuals do not show that it is wrong."""
+"""How sure a focal length is: it scales all depths and heights, and residuals do not show that it is wrong; and whether
+one lens took all photos that are to share one.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mvseg.poses.cancellable import quiet_colmap
 from mvseg.poses.numbers import TABLE
 
 
@@ -57,6 +60,56 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
     return found
 
 
+def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
+    """The focal length of each photo of a model in which several share a lens, if they do not: pixels, in the order of
+    the photos' numbers. None if one lens explains them, or nothing can be told.
+
+    One bundle adjustment with a lens for each photo, from where that of the shared lens ended.
+    """
+    if len(model.cameras) == model.num_reg_images():
+        return None
+    own = _with_own_lenses(model)
+    with quiet_colmap():
+        adjuster = _adjuster(own, pycolmap.BundleAdjustmentOptions(print_summary=False))
+        adjuster.solve()
+        own.update_point_3d_errors()
+        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), own, adjuster)
+    cameras = [own.cameras[number] for number in sorted(own.cameras)]
+    found = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
+    if any(each is None for each in found):
+        return None
+    lengths = np.array([each.params[0] for each in cameras])
+    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in found if each is not None])
+    groups: dict[int, list[int]] = {}
+    for place, number in enumerate(sorted(own.cameras)):
+        groups.setdefault(model.images[number].camera_id, []).append(place)
+    spread = max(float(lengths[group].std() / lengths[group].mean()) for group in groups.values())
+    doubt = float(np.median(deviations / lengths))
+    return lengths if spread > max(TABLE.sure, TABLE.apart * doubt) else None
+
+
+def say_zooms(lengths: NDArray[np.float64], shared: float) -> str:
+    """The sentence about focal lengths (V,) of photos that one lens of the focal length `shared` was to explain."""
+    ends = f"{lengths.min():.0f} to {lengths.max():.0f} px"
+    what = f"the photos were taken at different zooms (focal lengths from {ends}, and {shared:.0f} px for all)"
+    return f"{what}: cameras and lengths are wrong; --shared_camera false gives each photo a lens of its own"
+
+
+def _with_own_lenses(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """The same photos and points, each photo with a camera of its own, which has its number."""
+    own = pycolmap.Reconstruction()
+    for number in model.reg_image_ids():
+        image, camera = model.images[number], model.cameras[model.images[number].camera_id]
+        lens = {"model": camera.model_name, "width": camera.width, "height": camera.height}
+        own.add_camera_with_trivial_rig(pycolmap.Camera(**lens, params=camera.params.copy(), camera_id=number))
+        pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        alone = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=number, image_id=number)
+        own.add_image_with_trivial_frame(alone, image.cam_from_world())
+    for point in model.points3D.values():
+        own.add_point3D(point.xyz, point.track, point.color)
+    return own
+
+
 def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: int) -> float:
     """Pixels, standard deviation of the focal length that an adjustment with a fixed principal point finds;
     `covariance` is that of all numbers of the camera, with a free one."""
@@ -69,13 +122,19 @@ def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: 
 
 def _covariance(model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
     """The covariance of all parameters, for residuals of 1 pixel; None where they are not determined."""
+    adjuster = _adjuster(model, pycolmap.BundleAdjustmentOptions(refine_principal_point=True))
+    return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+
+
+def _adjuster(
+    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
+) -> pycolmap.CeresBundleAdjuster:
+    """A bundle adjustment of all photos of a model."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
 
 
 def _noise_px(model: pycolmap.Reconstruction) -> float:

@@ -221,15 +221,35 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
 
 
 def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit: str) -> Placement:
-    """The scale alone: the median ratio of distances, those of far pairs counting."""
+    """The scale alone: the median ratio of distances, those of far pairs counting.
+
+    Raises:
+        InputError: the cameras do not stand on one line, or all positions are at one place.
+    """
+    if len(centers) > 2 and np.ptp(target, axis=0).any() and not is_one_line(centers):
+        ranges = np.ptp(target, axis=0)
+        still = [axis for axis, range_ in zip("xyz", ranges, strict=True) if range_ <= WORLD.flat * ranges.max()]
+        hint = f" ({' and '.join(still)} hardly vary: are they degrees, of latitude and longitude?)" if still else ""
+        raise InputError(f"{path}: the positions lie on one line, and the cameras that took the photos do not{hint}")
     far = float(np.linalg.norm(target - target.mean(0), axis=1).max())
     pairs = [(i, j) for i, j in combinations(range(len(target)), 2) if np.linalg.norm(target[i] - target[j]) > far / 2]
     ratios = [np.linalg.norm(target[i] - target[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
     if not ratios:
         raise InputError(f"{path}: all positions are at one place, expected where the camera stood")
+    known, found = (_places_on_a_line(points) for points in (target, centers))
+    misfit = np.sqrt(max(0.0, 1 - np.corrcoef(known, found)[0, 1] ** 2))
+    if misfit > WORLD.misfit:
+        share = f"residual {misfit:.0%} of their spread"
+        warn(f"{path}: the positions hardly fit the photos ({share}): do the names match?")
     warn(f"{path}: the positions lie on one line, which gives a scale but no axes: the scene keeps its own")
     return Placement(
         similarity=scale_by(float(np.median(ratios))),
         unit=unit,
         source=f"{len(target)} positions on one line of {path.name}",
     )
+
+
+def _places_on_a_line(points: Floats) -> Floats:
+    """(P,) places of points along the axis on which they are spread most."""
+    away = points - points.mean(0)
+    return np.asarray(away @ np.linalg.svd(away, full_matrices=False)[2][0])

@@ -77,6 +77,7 @@ class TableNumbers:
     starts: tuple[float, ...] = (0.7, 1.4, 2.8)  # focal lengths in longer sides of the photo: from phones to telephoto
     noise_px: float = 0.1  # standard deviation of the corners, until it is measured
     least_noise_px: float = 0.02  # the same that is believed, at least
+    apart: float = 3.0  # spread of focal lengths of single photos, in their deviation, above which they differ
     sure: float = 0.01  # standard deviation of a focal length, as a share of it, at most: more shows in heights
     off_middle: float = 0.01  # the same of principal points of phones, cameras and webcams, of the photo's longer side
 

@@ -27,7 +27,8 @@ from mvseg.formats.opencv_yaml import Calibration
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.system.running import progress_bar
 
-FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
+FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM = 0x920A, 0xA405, 0xA404  # EXIF tags
+CAMERA_MODEL, EXIF_BLOCK = 0x0110, 0x8769
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class PhotoFile:
         name: path below `images/`, "/" between folders.
         width: pixels.
         height: pixels.
-        optics: what EXIF says of camera model and focal length; "" where it says nothing.
+        optics: what EXIF says of camera model, focal length and digital zoom; "" where it says nothing.
         is_turned: it was turned upright, as EXIF asks.
     """
 
@@ -161,7 +162,7 @@ def _describe_optics(image: Image.Image) -> str:
     try:
         exif = image.getexif()
         block = exif.get_ifd(EXIF_BLOCK)
-        known = [exif.get(CAMERA_MODEL), block.get(FOCAL_LENGTH), block.get(FOCAL_LENGTH_35MM)]
+        known = [exif.get(CAMERA_MODEL), block.get(FOCAL_LENGTH), block.get(FOCAL_LENGTH_35MM), block.get(DIGITAL_ZOOM)]
     except Exception:  # a damaged EXIF block says nothing
         return ""
     return " ".join(str(each).strip("\0 ") for each in known if each)

@@ -21,7 +21,8 @@ from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
 from mvseg.crop import Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.errors import InputError, check_arguments, faults_of
+from mvseg.errors import InputError, check_arguments, faults_of, warn
+from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.label_png import read_label_png, read_labels
@@ -202,10 +203,10 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
 
     Returns:
         D regions in the frames of the photos, whose `labels` are the ids of instances.json (-1 = matched to nothing),
-        and V true label maps.
+        and V true label maps. Photos without true labels are left out, as an InputWarning says.
 
     Raises:
-        InputError: the result or the truth is missing or broken.
+        InputError: the result or the truth is missing or broken; or no photo has true labels.
     """
     truth = truth / "labels" if (truth / "instances.json").is_file() else truth
     if not truth.is_dir():
@@ -213,12 +214,23 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
     labels = sorted(folder.glob("*.png"))
     if labels and not (folder / "instances.json").is_file():
         maps = [read_labels(path) for path in labels]
-        truths = [read_label_png(truth / path.name, *each.shape[::-1]) for path, each in zip(labels, maps, strict=True)]
-        return regions_from_label_maps(maps), truths
+        sizes = [(each.shape[1], each.shape[0]) for each in maps]
+        return _with_truth(regions_from_label_maps(maps), sizes, truth, [path.name for path in labels])
     result = load_result(folder)
-    sizes = result.scene.cameras.sizes.tolist()
-    views = zip(result.scene.views, sizes, strict=True)
-    return regions_in_photos(result), [read_label_png(truth / f"{view.name}.png", *size) for view, size in views]
+    sizes = [(width, height) for width, height in result.scene.cameras.sizes.tolist()]
+    return _with_truth(regions_in_photos(result), sizes, truth, [f"{view.name}.png" for view in result.scene.views])
+
+
+def _with_truth(
+    regions: Regions, sizes: Sequence[tuple[int, int]], truth: Path, names: Sequence[str]
+) -> tuple[Regions, list[np.ndarray]]:
+    """The regions of the photos that have true labels, and these: files of V `names` in a folder."""
+    taken = [view for view, name in enumerate(names) if (truth / name).is_file()] or list(range(len(names)))
+    if left_out := [name for view, name in enumerate(names) if view not in taken]:
+        what = f"{len(left_out)} of {len(names)} photos have no true labels ({list_some(left_out)})"
+        warn(f"{truth}: {what}, and are left out")
+        regions = regions.of_views(torch.tensor(taken))
+    return regions, [read_label_png(truth / names[view], *sizes[view]) for view in taken]
 
 
 def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:

@@ -17,7 +17,7 @@ from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import Known, PoseConfig
-from mvseg.poses.focal_length import FocalLength, focal_lengths, least_sure
+from mvseg.poses.focal_length import FocalLength, find_zooms, focal_lengths, least_sure, say_zooms
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
@@ -75,6 +75,9 @@ def pose_photos(
             files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, images)
             structure = find_structure(images, files, config=config, calibration=calibration, work=folder)
             lengths = focal_lengths(structure.model, is_given=calibration is not None)
+            zooms = None if calibration is not None else find_zooms(structure.model)
+            if zooms is not None:
+                warn(say_zooms(zooms, lengths[0].px))
             for sentence in least_sure(lengths).doubts(mend=MEND):
                 warn(sentence)
             placement = place(write_structure(structure, folder), known)

@@ -181,8 +181,13 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
     """The dates in order of time, all lengths in the unit of the first.
 
     Raises:
-        InputError: two dates have the same time, numbers and ISO dates are mixed, or units cannot be converted.
+        InputError: two dates have the same time, numbers and ISO dates are mixed, units cannot be converted, or a leaf
+            has points that are no numbers.
     """
+    for date in dates:
+        for leaf in date.leaves:
+            if not all(each is None or np.isfinite(each).all() for each in (leaf.midrib, leaf.normal, leaf.points)):
+                raise InputError(f"{date.scene}: leaf {leaf.leaf} has points that are no finite numbers")
     are_iso = {_is_iso(date.written) for date in dates}
     if len(are_iso) > 1:
         raise InputError("the times are numbers and ISO dates, expected one of the two for all dates of a plant")

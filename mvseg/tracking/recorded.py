@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mvseg.corrections.file import Edit
 from mvseg.corrections.track_links import LeafLink, find_links
@@ -64,6 +64,12 @@ class _Plant(_Part):
     plant: str
     results: tuple[str, ...]
     times: tuple[str, ...]
+
+    @model_validator(mode="after")
+    def _as_many(self) -> _Plant:
+        if len(self.results) != len(self.times):
+            raise ValueError(f"{len(self.times)} times for {len(self.results)} results, expected one for each")
+        return self
 
 
 class _Config(_Part):

@@ -18,8 +18,8 @@ Orientation = Literal["any", "upright", "fixed"]
 # These may differ when a run is resumed: they do not change what is computed. (The names of the samples are compared
 # separately, so the data may have moved.)
 FREE_ON_RESUME = {"photos", "labels", "from_results", "val_photos", "val_labels", "backgrounds", "skins",
-                  "skip_broken", "output", "resume", "device", "num_workers", "checkpoint_every",
-                  "log_every"}  # fmt: skip
+                  "skip_broken", "skip_unlabelled", "output", "resume", "device", "num_workers",
+                  "checkpoint_every", "log_every"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -42,6 +42,8 @@ class TrainConfig:
             pixels are ignored.
         skip_broken: train without broken samples (they are counted and listed in broken_samples.txt) instead of
             stopping.
+        skip_unlabelled: leave out photos for which nobody has drawn or stated anything yet, instead of learning them
+            as photos without leaves. (An empty label image states that there are none.)
         arch: resnet18_fpn, mobilenet_v3_large_fpn, efficientnet_lite0, efficientnet_lite2, maskrcnn_resnet50_fpn,
             maskrcnn_resnet50_fpn_v2.
         weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the first two: downloaded), IMAGENET1K
@@ -100,6 +102,7 @@ class TrainConfig:
     hold_out_every: int = 0
     coco_crowd: Literal["mask", "ignore"] = "mask"
     skip_broken: bool = False
+    skip_unlabelled: bool = False
     arch: str = "resnet18_fpn"
     weights: str | None = None
     heads: str | None = None

@@ -278,8 +278,13 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
     return [0 if isinstance(answer, str) else answer[0] for answer in answers], broken
 
 
-def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[SampleList, dict[int, str]]:
+def keep_sound(
+    samples: SampleList, what: str, *, skip_broken: bool, skip_unlabelled: bool = False
+) -> tuple[SampleList, dict[int, str]]:
     """The samples that can be used, and what is wrong with the others; `what` they are called in messages.
+
+    Warns (InputWarning) of photos without labels, which would be learned as photos without leaves, unless
+    `skip_unlabelled` leaves them out.
 
     Raises:
         InputError: a sample is broken and `skip_broken` is off (the message counts them and describes the first three);
@@ -296,4 +301,11 @@ def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[Sa
         )
     if not sum(counts):
         raise InputError(f"none of the {len(samples)} {what} samples holds an instance, expected at least one")
-    return samples.select([index for index in range(len(samples)) if index not in broken]), broken
+    every = range(len(samples))
+    unlabelled = {index for index in every if not (counts[index] or samples.samples[index].files or index in broken)}
+    if unlabelled and not skip_unlabelled:
+        learned = f"{len(unlabelled)} of {len(samples)} {what} photos have no labels (the first is "
+        learned += f"{samples.samples[min(unlabelled)].name}), and are taken for photos without leaves"
+        warn(f"{learned}; --skip_unlabelled true leaves them out")
+    left_out = broken.keys() | (unlabelled if skip_unlabelled else set())
+    return samples.select([index for index in every if index not in left_out]), broken

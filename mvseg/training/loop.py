@@ -27,6 +27,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -146,10 +147,11 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
         indices = range(len(samples))
         held_out = samples.select(indices[:: config.hold_out_every])
         samples = samples.select([index for index in indices if index % config.hold_out_every])
-    samples, broken = keep_sound(samples, "training", skip_broken=config.skip_broken)
+    keep = partial(keep_sound, skip_broken=config.skip_broken, skip_unlabelled=config.skip_unlabelled)
+    samples, broken = keep(samples, "training")
     problems = list(broken.values())
     if held_out is not None:
-        held_out, broken = keep_sound(held_out, "validation", skip_broken=config.skip_broken)
+        held_out, broken = keep(held_out, "validation")
         problems += broken.values()
     num_held_out = len(held_out) if held_out is not None else 0
     logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))

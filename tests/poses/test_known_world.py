@@ -120,6 +120,20 @@ def test_positions_on_a_line_give_the_scale_only(room, tmp_path: Path) -> None:
     np.testing.assert_array_equal(placement.similarity.rotation.matrix(), np.eye(3))
 
 
+def test_positions_on_a_line_must_fit_the_cameras(room, tmp_path: Path) -> None:
+    """Degrees of latitude and longitude beside metres of height; and a rail with the names of other photos."""
+    degrees = np.column_stack([np.linspace(8.65, 8.6501, 7), np.linspace(49.9, 49.9001, 7), np.linspace(119, 121, 7)])
+    path = write_positions(tmp_path / "gps.csv", degrees)
+    with pytest.raises(InputError, match="do not \\(x and y hardly vary: are they degrees, of latitude and longitude"):
+        place(room.scene, Known(positions=path))
+    line = np.outer(np.arange(7.0) ** 2, [10.0, 0, 0])
+    centers = room.scene.cameras.centers.new_tensor(line[[3, 4, 5, 6, 0, 1, 2]])
+    cameras = replace(room.scene.cameras, t=-(room.scene.cameras.R @ centers[:, :, None])[:, :, 0])
+    with pytest.warns(InputWarning) as said:
+        place(replace(room.scene, cameras=cameras), Known(positions=write_positions(tmp_path / "rail.csv", line)))
+    assert "the positions hardly fit the photos (residual " in str(said[0].message)
+
+
 def test_left_handed_positions_are_refused(room, tmp_path: Path) -> None:
     path = write_positions(tmp_path / "log.csv", room.truth.centers.numpy() * [1, -1, 1])
     with pytest.raises(InputError, match="points are mirrored"):

@@ -21,7 +21,7 @@ import mvseg.results.plant_files
 import mvseg.results.report.page
 from known_leaves import bent_blade
 from mvseg.config import RunConfig
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
@@ -625,6 +625,15 @@ class TestReadInstances:
         (broken / "instances.json").write_text(json.dumps(content))
         with pytest.raises(InputError, match=rf"instances\.json: {message}"):
             read_instances(broken, plant / "truth")
+
+    def test_photos_without_truth_are_left_out_and_counted(self, saved: Path, plant: Path, tmp_path: Path) -> None:
+        for view in (0, 3):
+            shutil.copy(plant / "truth" / f"{view:03d}.png", tmp_path)
+        with pytest.warns(InputWarning, match=r"2 of 4 photos have no true labels \(001.png, 002.png\), and are left out"):
+            regions, truth = read_instances(saved, tmp_path)
+        every, all_truth = read_instances(saved, plant / "truth")
+        assert regions.num_per_view.tolist() == every.num_per_view[[0, 3]].tolist()
+        np.testing.assert_array_equal(truth, [all_truth[0], all_truth[3]])
 
     def test_truth_of_another_size(self, saved: Path, tmp_path: Path) -> None:
         for view in range(4):

@@ -81,6 +81,16 @@ def test_repeated_and_mixed_times_are_refused() -> None:
         order_dates([date, iso])
 
 
+def test_points_that_are_no_numbers_are_refused() -> None:
+    date = see(grow_blades(4, 0), 0)[0]
+    midrib = date.leaves[1].midrib
+    assert midrib is not None
+    torn = replace(date.leaves[1], midrib=midrib * np.nan)
+    later = replace(date, scene="other", time=2.0, written="2", leaves=(date.leaves[0], torn))
+    with pytest.raises(InputError, match=f"other: leaf {torn.leaf} has points that are no finite numbers"):
+        order_dates([date, later])
+
+
 def test_units_are_converted_or_refused() -> None:
     first, other = see(grow_blades(4, 0), 0)[0], see(grow_blades(4, 0), 1, unit="cm")[0]
     _, later = order_dates([first, other])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -322,6 +323,29 @@ def test_broken_label_maps(tmp_path: Path) -> None:
     kept, left_out = keep_sound(found, "training", skip_broken=True)
     assert [sample.name for sample in kept.samples] == ["a_sound.png", "d_colour.png"]
     assert left_out == broken
+
+
+@pytest.mark.parametrize("kind", ["labelme", "COCO"])
+def test_photos_that_nobody_has_labelled_yet(kind: str, tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_image(tmp_path / "photos" / f"{name}.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    corners = [[2.0, 2.0], [9.0, 2.0], [9.0, 8.0]]
+    shapes = [{"label": "leaf", "points": corners, "shape_type": "polygon"}]
+    images = [{"id": n, "file_name": f"{n}.png", "width": WIDTH, "height": HEIGHT} for n in "abc"]
+    drawn = [{"id": 1, "image_id": "a", "category_id": 1, "segmentation": [[2.0, 2.0, 9.0, 2.0, 9.0, 8.0]]}]
+    (tmp_path / "labels").mkdir()
+    labels = tmp_path / "labels" / ("a.json" if kind == "labelme" else "all.json")
+    labels.write_text(json.dumps(
+        {"shapes": shapes, "imagePath": "a.png", "imageHeight": HEIGHT, "imageWidth": WIDTH} if kind == "labelme"
+        else {"images": images, "annotations": drawn, "categories": [{"id": 1, "name": "leaf"}]}
+    ))  # fmt: skip
+    with warnings.catch_warnings(action="ignore"):  # labelme: of photos without a file
+        found = list_samples(tmp_path / "photos", tmp_path / "labels" if kind == "labelme" else labels)
+    with pytest.warns(InputWarning, match=r"2 of 3 training photos have no labels \(the first is b.png"):
+        kept, _ = keep_sound(found, "training", skip_broken=False)
+    assert len(kept) == 3
+    kept, _ = keep_sound(found, "training", skip_broken=False, skip_unlabelled=True)
+    assert [sample.name for sample in kept.samples] == ["a.png"]
 
 
 def test_folders_that_hold_nothing(tmp_path: Path) -> None:
