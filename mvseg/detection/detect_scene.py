@@ -17,6 +17,7 @@ from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
+from mvseg.errors import warn
 from mvseg.formats.photos import Photos
 from mvseg.matching.config import MatchConfig
 from mvseg.system.file_hash import hash_files
@@ -43,7 +44,8 @@ def detect_scene(
         boxes: (V, 4) int64 xyxy, the parts of the photos that show the plant, from an earlier look; None: look for it.
 
     Returns:
-        The look, matched with the cameras of the photos.
+        The look, matched with the cameras of the photos. Warns (InputWarning) of photos of more proposals than are
+        taken: a detector that knows nothing proposes masks everywhere, each of which the views would have to judge.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
@@ -52,7 +54,12 @@ def detect_scene(
     least = min(DETECTION.least_score, config.min_score) if config.verify else config.min_score
     detector = load_detector(config.weights, image_size=config.image_size, min_score=least)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
+    model = MultiViewMaskRCNN(
+        fold_norms(detector),
+        num_iterations=config.num_iterations,
+        proposals_per_view=DETECTION.most_proposals,
+        match=match,
+    ).to(device)
     made_by = describe_detector(config, model, device)
 
     def look_at(boxes: Tensor | None) -> Look:
@@ -63,6 +70,9 @@ def detect_scene(
     if boxes is None and config.crop == "auto":
         boxes = boxes_for_second_pass(look.sure.masks, cameras, longest=model.transform.max_size)
         look = look if boxes is None else look_at(boxes)
+    if num_full := sum(len(each["scores"]) >= DETECTION.most_proposals for each in look.detections):
+        most = f"the best {DETECTION.most_proposals} are taken"
+        warn(f"the detector proposes very many masks in {num_full} photos ({most}): does it know such plants?")
     return look
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,8 @@ from mvseg.detection.cached_detections import (
 )
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
-from mvseg.errors import InputError
+from mvseg.detection.numbers import DETECTION
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_image, write_scene
@@ -118,6 +120,21 @@ class TestClaim:
         with claim_cache(tmp_path / "kept", tmp_path):
             pass
         assert [path.name for path in (tmp_path / "kept").iterdir()] == ["notes.txt"]
+
+
+def test_a_detector_that_proposes_masks_everywhere_is_bounded_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, config = load_scene(write_scene(tmp_path / "plant", 2)), DetectConfig(min_score=0.2)
+    everything = detect_scene(Photos(scene), config).proposals(scene.cameras)
+    assert everything.regions.num_per_view.min() > 2
+    monkeypatch.setattr("mvseg.detection.detect_scene.DETECTION", replace(DETECTION, most_proposals=2))
+    with pytest.warns(InputWarning, match=r"proposes very many masks in 2 photos \(the best 2 are taken\)"):
+        best = detect_scene(Photos(scene), config).proposals(scene.cameras)
+    assert best.regions.num_per_view.tolist() == [2, 2]
+    for view in range(2):
+        scores = everything.detection_scores[everything.view_index == view]
+        assert torch.equal(best.detection_scores[best.view_index == view], scores.sort(descending=True)[0][:2])
 
 
 def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -247,8 +247,10 @@ class ClusterScores:
             cluster, label = index_of[clusters.ids[region[hypothesis]]], labels[hypothesis, view]
             num_pixels += np.bincount(cluster * num_views + view, share, num_pixels.size).reshape(num_pixels.shape)
             hit = label >= 0
-            place = cluster[hit] * num_regions + label[hit]
-            covered += np.bincount(place, share[hit], covered.size).reshape(covered.shape)
+            first, last = cluster.min(initial=0), cluster.max(initial=0) + 1  # of few clusters at a time
+            place = (cluster[hit] - first) * num_regions + label[hit]
+            part = covered[first:last]
+            part += np.bincount(place, share[hit], part.size).reshape(part.shape)
         return (covered / np.maximum(num_pixels, 1e-9)[:, sweep.view_index]).astype(np.float32)
 
     def _may_be_best(self, hypotheses: Ints, score: Floats) -> NDArray[np.bool_]:
