@@ -20,7 +20,7 @@ class DetectionNumbers:
     sure_score: float = 0.3  # score of the proposals that are matched first, at least
     more_score: float = 0.1  # score of those that are matched for more candidates, at least
     least_score: float = 0.05  # score of the whole excessive set, at least: torchvision's threshold
-    most_proposals: int = 200  # limit: proposals of a view, the best ones; a plant of 45 leaves has up to 160, ferns 190
+    most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
     mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
     few_views: int = 2  # views of a leaf that is added as it was found, at most
