@@ -152,7 +152,9 @@ class SearchNumbers:
     few_masks: int = 60  # limit: masks below which they are fitted in this process: others would take longer to start
     searched_views: int = 12  # limit: views of a leaf in which starts are compared, evenly spread
     most_starts: int = 3  # starts of each hull that are tried, at most
-    most_fits: int = 3  # limit: starts that are fitted
+    most_fits: int = 3  # limit: starts that are fitted, but for rough fits
+    clear_iou: float = 0.75  # median IoU of the likely start, before any fit, from which a rough fit tries no other one
+    least_gain: float = 0.03  # IoU by which another start must be better, for a rough fit to take it
     good_iou: float = 0.93  # median IoU of a patch above which the second hull is not asked
     forgiven: float = 0.5  # share of IoU given back where all masks are too large or small: faulty masks reach less
     as_good: float = 0.03  # IoU below the best one down to which fits are as good, the less the more they lack

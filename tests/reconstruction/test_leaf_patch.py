@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.interpolate import BSpline
+from scipy.spatial.transform import Rotation
 
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
@@ -19,7 +20,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_grid,
     patch_prior,
 )
-from mvseg.reconstruction.surface.orientation import mirror_matrix, stem_distances, turn_matrix
+from mvseg.reconstruction.surface.orientation import base_distances, mirror_matrix, stem_distances, turn_matrix
 from mvseg.reconstruction.surface.patch_start import start_patches
 
 
@@ -105,6 +106,31 @@ def test_stem_is_where_the_bases_line_up() -> None:
     swapped = rng.random(9) < 0.5
     ends[swapped] = ends[swapped, ::-1]
     assert (stem_distances(ends).argmin(1) == swapped).all()
+
+
+@pytest.mark.parametrize("num_leaves", [2, 3])
+def test_the_bases_of_a_seedling_are_the_ends_that_are_nearest_to_each_other(num_leaves: int) -> None:
+    rng = np.random.default_rng(num_leaves)
+    for _ in range(20):
+        stem = rng.normal(0, 0.08, (num_leaves, 3))
+        turns = 2 * np.pi * (np.arange(num_leaves) / num_leaves + rng.uniform(-0.1, 0.1, num_leaves))
+        ahead = np.stack([np.cos(turns), np.sin(turns), rng.uniform(-0.3, 0.8, num_leaves)], 1)
+        ends = np.stack([stem, stem + ahead], 1)
+        swapped = rng.integers(0, 2, num_leaves)
+        ends[swapped == 1] = ends[swapped == 1][:, ::-1]
+        distances = base_distances(ends)
+        assert (distances.argmin(1) == swapped).all()
+        order, turn = rng.permutation(num_leaves), Rotation.random(random_state=1).as_matrix()
+        np.testing.assert_allclose(base_distances(7 * ends[order] @ turn.T + 5), 7 * distances[order])
+
+
+def test_a_single_leaf_and_leaves_side_by_side_stay_as_they_are() -> None:
+    assert base_distances(np.zeros((0, 2, 3))).shape == (0, 2)
+    one = np.array([[[0.0, 0, 0], [1, 0, 0]]])
+    assert base_distances(one).tolist() == [[0, 0]]
+    beside = np.concatenate([one, one + (0, 1, 0)])
+    distances = base_distances(beside)
+    assert (distances[:, 0] < distances[:, 1]).all()  # of two choices that are equal, the ends that come first
 
 
 @pytest.mark.parametrize("bend", [1e3, 0.45])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -137,28 +137,27 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
 def _fit_first(asked: tuple[MaskStack, Floats | None], *, is_rough: bool) -> tuple[MaskStack, PatchFit | None]:
     """The first fit of an instance, from a start that is nearly right or from those that are found, and its masks.
 
-    Of several fits the best one, and how far the areas of those that are nearly as good are from its own. Rough fits
-    are of masks some of which are another leaf's, so that medians over the views choose among them.
+    Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
     """
     masks, start = asked
-    masks, starts = (masks, [start]) if start is not None else _find_starts(masks)
+    masks, starts = (masks, [start]) if start is not None else _find_starts(masks, is_rough=is_rough)
     fits = [fit_patch(masks, each, num_steps=SEARCH.first_steps) for each in starts]
     if len(fits) < 2:
         return masks, fits[0] if fits else None
     areas = np.array([measure_sizes(fit.coefficients)[0] for fit in fits])
-    scores = np.array(
-        [_fine_rank(masks, fit, np.median if is_rough else np.mean) - _area_cost(fit.coefficients) for fit in fits]
-    )
+    scores = np.array([_fine_rank(masks, fit) - _area_cost(fit.coefficients) for fit in fits])
     best = int(scores.argmax())
     weights = np.maximum(0, 1 - (scores[best] - scores) / SEARCH.as_good)
     spread = float(np.sqrt(weights @ (areas / areas[best] - 1) ** 2 / weights.sum()))
     return masks, replace(fits[best], spread=spread)
 
 
-def _find_starts(masks: MaskStack) -> tuple[MaskStack, list[Floats]]:
+def _find_starts(masks: MaskStack, *, is_rough: bool) -> tuple[MaskStack, list[Floats]]:
     """The best of several starts, moved to the masks; and the masks that are right.
 
-    The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
+    Rough fits have one. They tell leaves from what is none, and among many starts masks of two leaves find one, too,
+    that seems to explain them: so others than the likeliest are only tried where that ends badly. The first hull asks
+    that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
     axes = masks.axes
     masks = masks.turn_world(axes)
@@ -174,10 +173,13 @@ def _find_starts(masks: MaskStack) -> tuple[MaskStack, list[Floats]]:
     few = _few_views(masks, hull.points.mean(0))
     found = _Found()
     for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
-        if not found.is_good:
-            found = _try_starts(few, _likely_starts(few, replace(hull, voxels=hull.voxels[keep])), found)
-    order = sorted(range(len(found.patches)), key=lambda index: -found.scores[index])
-    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in order[:SEARCH.most_fits]]
+        if found.is_good:
+            break
+        likely = _likely_starts(few, replace(hull, voxels=hull.voxels[keep]), is_rough=is_rough)
+        for starts in (likely[:1], likely[1:]) if is_rough else (likely,):
+            found = found if found.is_good else _try_starts(few, starts, found)
+    best = found.likely_best() if is_rough else found.best(SEARCH.most_fits)
+    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in best]
 
 
 def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
@@ -196,6 +198,18 @@ class _Found:
     scores: tuple[float, ...] = ()
     is_good: bool = False
     half_way: float = -np.inf
+
+    def best(self, most: int) -> list[int]:
+        """Indices of the patches, the one with the best score first."""
+        return sorted(range(len(self.patches)), key=lambda index: -self.scores[index])[:most]
+
+    def likely_best(self) -> list[int]:
+        """Index of the likeliest patch that none after it beats clearly; nothing without a patch."""
+        best: list[int] = []
+        for index, score in enumerate(self.scores):
+            if not best or score > self.scores[best[0]] + SEARCH.least_gain:
+                best = [index]
+        return best
 
 
 def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found:
@@ -220,9 +234,12 @@ def _area_cost(coefficients: Floats) -> float:
     return SEARCH.area_cost * float(np.log(measure_sizes(coefficients)[0]))
 
 
-def _likely_starts(masks: MaskStack, hull: Hull) -> list[Floats]:
-    """How well a start explains the masks, before any fit, tells how likely it is."""
+def _likely_starts(masks: MaskStack, hull: Hull, *, is_rough: bool) -> list[Floats]:
+    """How well a start explains the masks, before any fit, tells how likely it is. For a rough fit the first one is
+    enough where it shows clearly how the blade lies."""
     starts = start_in(hull)
+    if is_rough and starts and _rank(masks, starts[0]) >= SEARCH.clear_iou:
+        return starts[:1]
     ranks = [_rank(masks, start) for start in starts]
     return [starts[index] for index in sorted(range(len(ranks)), key=lambda index: -ranks[index])[:SEARCH.most_starts]]
 
@@ -244,12 +261,11 @@ def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None)
     return float(np.median(crop_ious(masks, covered, offsets=offsets))) - _wide_cost(coefficients)
 
 
-def _fine_rank(masks: MaskStack, fit: PatchFit, average: Callable[[Floats], np.floating]) -> float:
-    """The same, finely; with the mean IoU for its average: of fits that are nearly as good, medians pick one by
-    chance."""
+def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
+    """The same, finely, of the mean IoU: of fits that are nearly as good, medians pick one by chance."""
     points = patch_grid(*FIT.grid).points(fit.coefficients)
     ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
-    return float(average(ious)) - _wide_cost(fit.coefficients)
+    return float(ious.mean()) - _wide_cost(fit.coefficients)
 
 
 def _wide_cost(coefficients: Floats) -> float:

@@ -1,18 +1,18 @@
 """Which end of a leaf is its base, and which of its sides is up.
 
-Bases sit on the stem: over the leaves of a plant, the ends that lie along one line. The upper side is the one that the
-cameras look at.
+Bases sit on the stem: over the leaves of a plant, the ends that lie along one line. Of the two or three leaves of a
+seedling, the ends that are nearest to each other. The upper side is the one that the cameras look at.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import torch
 
-from mvseg.reconstruction.numbers import STEM
+from mvseg.reconstruction.numbers import RAYS, STEM
 from mvseg.reconstruction.surface.leaf_patch import COUNTS, NUM_COEFFICIENTS, SIDE, Floats
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
@@ -39,13 +39,13 @@ def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[
     there = {instance: surface for instance, surface in surfaces.items() if surface.exists}
     oriented = dict(surfaces)
     ends = np.array([surface.midrib[[0, -1]].numpy() for surface in there.values()]).reshape(-1, 2, 3)
-    to_stem = stem_distances(ends) if len(there) >= STEM.least_leaves else None
-    for index, (instance, surface) in enumerate(there.items()):
-        if to_stem is not None:
-            first, last = to_stem[index]
-            if last < first:
-                surface = _transform(surface, turn_matrix())
-            surface = replace(surface, is_oriented=bool(abs(first - last) > STEM.clear * surface.length))
+    has_stem = len(there) >= STEM.least_leaves
+    distances = stem_distances(ends) if has_stem else base_distances(ends)
+    for (instance, surface), (first, last) in zip(there.items(), distances, strict=True):
+        is_clear = has_stem and abs(first - last) > STEM.clear * surface.length
+        if last < first:
+            surface = _transform(surface, turn_matrix())
+        surface = replace(surface, is_oriented=bool(is_clear))
         towards = cameras.centers[surface.views].mean(0).cpu() - surface.midrib.mean(0)
         oriented[instance] = _transform(surface, mirror_matrix()) if towards @ surface.normal < 0 else surface
     return oriented
@@ -68,6 +68,23 @@ def stem_distances(ends: Floats) -> Floats:
         away = away - (away @ direction)[..., None] * direction
         distances = np.linalg.norm(away, axis=2)
     return distances
+
+
+def base_distances(ends: Floats) -> Floats:
+    """(N, 2) sums of the distances of both ends of N leaves from the bases of the others: the ends, one of each leaf,
+    that are nearest to each other. All choices are compared, so it is for few leaves; 0 for a single one.
+
+    Args:
+        ends: (N, 2, 3).
+    """
+    own = np.arange(len(ends))
+    apart = np.linalg.norm(ends[:, :, None, None] - ends, axis=-1)  # (N, 2, N, 2) between all ends
+    choices = [np.array(each, int) for each in product((0, 1), repeat=len(ends))]
+    sums = np.array([apart[own[:, None], chosen[:, None], own, chosen].sum() for chosen in choices])
+    bases = choices[int((sums <= sums.min() * (1 + RAYS.tie)).argmax())]
+    to_bases = apart[:, :, own, bases]
+    to_bases[own, :, own] = 0
+    return to_bases.sum(2)
 
 
 def _transform(surface: LeafSurface, matrix: Floats) -> LeafSurface:
