@@ -3,6 +3,7 @@
     python -m benchmarks.tracking simulated --num_plants 12            leaves as seen: meshes with noise, no photos
     python -m benchmarks.tracking two --num_plants 8 --turn 60         two of them in one pot, one turned by itself
     python -m benchmarks.tracking results TABLE RESULTS [...]          results of mvseg batch, or of `prepare`
+    python -m benchmarks.tracking results TABLE RESULTS --turned 10    the same, each pot turned at random, ten times
     python -m benchmarks.tracking prepare TABLE RESULTS                surfaces from true masks with true ids
     python -m benchmarks.tracking prepare TABLE RESULTS --masks degraded    from degraded masks, matched by mvseg
 
@@ -30,6 +31,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from benchmarks.faults import Faults, degrade_labels
 from mvseg.formats.label_png import read_labels
@@ -330,6 +332,41 @@ def read_places(places: Sequence[Path]) -> dict[str, dict[str, tuple[list[PlantO
             for table, results in zip(places[::2], places[1::2], strict=True)}  # fmt: skip
 
 
+# --- pots that are turned
+
+
+def turn_date(date: PlantOnDate, degrees: float) -> PlantOnDate:
+    """The same date, its pot turned about the vertical through the origin: surfaces do not depend on how the world
+    stands, so its photos need not be matched again."""
+    turn = Rotation.from_rotvec([0, 0, np.radians(degrees)]).as_matrix().T
+    leaves = tuple(
+        replace(leaf, midrib=leaf.midrib @ turn, normal=leaf.normal @ turn, points=leaf.points @ turn)
+        if leaf.midrib is not None and leaf.normal is not None and leaf.points is not None
+        else leaf
+        for leaf in date.leaves
+    )
+    return replace(date, leaves=leaves)
+
+
+def compare_turned(series: dict[str, tuple[list[PlantOnDate], Labels]], num_draws: int) -> None:
+    """Print a row per plant, and their mean: of all draws, with the standard error over these."""
+    print("| pots turned at random | short | long |\n|---|---|---|")
+    found = np.zeros((len(series), num_draws, 2))
+    for index, (plant, (dates, truth)) in enumerate(series.items()):
+        for draw in range(num_draws):
+            rng = np.random.default_rng([draw, *plant.encode()])
+            angles = rng.uniform(0, 360, len(dates))
+            turned = [turn_date(date, angle) for date, angle in zip(dates, angles, strict=True)]
+            figures = measure(truth, labels_of(track_leaves(turned)))
+            found[index, draw] = figures["short"], figures["long"]
+        short, long = found[index].mean(0)
+        print(f"| ... {plant} | {short:.3f} | {long:.3f} |", flush=True)
+    means = found.mean(0)
+    errors = means.std(0, ddof=1) / np.sqrt(num_draws) if num_draws > 1 else np.full(2, np.nan)
+    shown = " | ".join(f"{mean:.3f} +- {error:.3f}" for mean, error in zip(means.mean(0), errors, strict=True))
+    print(f"| {num_draws} draws | {shown} |")
+
+
 # --- tables
 
 
@@ -395,6 +432,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--masks", choices=("true", "degraded"), default="true", help="of prepare")
     parser.add_argument("--turn", type=float, default=60.0, help="of two: degrees by which one plant is turned")
+    parser.add_argument("--turned", type=int, default=0, help="of results: draws of turns of all pots")
     parser.add_argument("--methods", nargs="*", default=["nearest base", "shape", "rank", "cpd"])
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -402,7 +440,10 @@ def main() -> None:
         prepare(*args.places, masks=args.masks)
     elif args.what == "results":
         for series in read_places(args.places).values():
-            compare(series, args.methods)
+            if args.turned:
+                compare_turned(series, args.turned)
+            else:
+                compare(series, args.methods)
     elif args.what == "simulated":
         specs = draw_specs(args.num_plants, seed=args.seed)
         compare({spec.name: see_series(spec) for spec in specs}, args.methods)
