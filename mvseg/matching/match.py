@@ -186,6 +186,8 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
         warn("the masks of all views are empty: there are no instances")
+    elif bool((2 * regions.boxes[:, 2:] <= cameras.sizes[regions.view_index]).all()):
+        warn("all masks lie in the upper left quarters of their photos: are they masks of photos of half the size?")
     pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
     if pairs:
         first = "views {} and {} share a camera centre".format(*pairs[0])

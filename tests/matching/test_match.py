@@ -56,6 +56,14 @@ def test_same_seed_same_answer_and_any_order_of_views() -> None:
     assert matching_metrics(matching.instance_ids, turned.regions.labels).ari == 1
 
 
+def test_masks_of_photos_of_half_the_size_are_said(demo_scene: Scene, demo_regions: Regions) -> None:
+    sizes = demo_scene.cameras.sizes.tolist()
+    maps = [demo_regions.label_map(view, demo_regions.labels, size).numpy() for view, size in enumerate(sizes)]
+    with pytest.warns(InputWarning) as said:
+        match_regions(regions_from_label_maps([each[::2, ::2] for each in maps]), demo_scene.cameras)
+    assert "all masks lie in the upper left quarters of their photos" in str(said[0].message)
+
+
 def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
     from mvseg.matching.affinity import region_affinity
 
