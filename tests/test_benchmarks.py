@@ -20,7 +20,7 @@ SCRIPTS = sorted(
 def test_they_are_imported_and_print_their_help(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert len(SCRIPTS) > 50
+    assert len(SCRIPTS) > 40
     for name in SCRIPTS:
         script = importlib.import_module(name)
         assert script.__doc__, name

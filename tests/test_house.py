@@ -279,8 +279,8 @@ def test_both_doors_have_an_example_that_runs(tmp_path: Path, monkeypatch: pytes
     assert sum(sizes) >= 85  # of 108 visible leaves
 
 
-# Links of Markdown, and paths in it that start at the root.
-PATHS = re.compile(r"\]\(([^)#]+)|\b((?:mvseg|benchmarks|configs|docs|models|tests)/[\w/.-]+\.\w+)")
+# Links of Markdown, and paths in it that start at the root, but for those of a commit (`git show COMMIT:PATH`).
+PATHS = re.compile(r"\]\(([^)#]+)|(?<!:)\b((?:mvseg|benchmarks|configs|docs|models|tests)/[\w/.-]+\.\w+)")
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/notes/*.md"), *ROOT.glob("models/**/*.md")]
 
 

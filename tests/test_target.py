@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.target import MIDDLE, aim_cameras, write_photos
 from mvseg.checks.target_masks import cut_shapes
 from mvseg.cli import main
 from mvseg.demo import demo_scene
@@ -25,6 +24,7 @@ from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.result import Result
 from mvseg.runs import check_target
 from mvseg.scene import Cameras
+from photographed_page import MIDDLE, aim_cameras, write_photos
 
 SIZE, FOCAL = (960, 720), 750.0
 

@@ -32,10 +32,7 @@ import torch
 
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import visible_ids
-from benchmarks.speed.rivals import measure_rivals
 from benchmarks.speed.write_up import growth_lines, write_all
-from mvseg.regions import regions_from_label_maps
-from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
 
@@ -174,11 +171,8 @@ def main() -> None:
             print("\n".join(growth_lines(records, {})))
             return
         threads = measure_threads(versions, rounds=args.rounds, cache=cache)
-        with np.load(make_scene(BASE, cache)) as saved:
-            cameras = Cameras(**{name: torch.from_numpy(saved[name]) for name in ("K", "R", "t", "sizes")})
-            rivals = measure_rivals(regions_from_label_maps(list(saved["true"])), cameras)
     args.into.mkdir(parents=True, exist_ok=True)
-    write_all(args.into, records, threads, rivals)
+    write_all(args.into, records, threads)
 
 
 if __name__ == "__main__":

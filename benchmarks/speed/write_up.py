@@ -12,11 +12,10 @@ import numpy as np
 SHOWN = ("load", "affinity", "matching", "pictures")
 
 
-def write_all(
-    into: Path, records: list[dict[str, Any]], threads: list[dict[str, Any]], rivals: dict[str, float]
-) -> None:
+def write_all(into: Path, records: list[dict[str, Any]], threads: list[dict[str, Any]]) -> None:
     """The JSON, the plot and the tables; without records of the growth, what is there of it stays."""
-    report, tables = {"threads": threads, "rivals": rivals}, {"threads": threads_lines(threads, rivals)}
+    report: dict[str, Any] = {"threads": threads}
+    tables = {"threads": threads_lines(threads)}
     if records:
         versions = sorted({record["version"] for record in records})
         slopes = {name: fit_slopes([record for record in records if record["version"] == name]) for name in versions}
@@ -69,8 +68,8 @@ def growth_lines(records: list[dict[str, Any]], slopes: dict[str, dict[str, floa
     return lines
 
 
-def threads_lines(records: list[dict[str, Any]], rivals: dict[str, float]) -> list[str]:
-    """Markdown: one row per stage, with one and with two threads, and the rivals. "a / b" is now / previous."""
+def threads_lines(records: list[dict[str, Any]]) -> list[str]:
+    """Markdown: one row per stage, with one and with two threads. "a / b" is now / previous."""
     of = {(record["version"], record["threads"]): record for record in records}
     views, leaves, megapixels = records[0]["cell"]
     base = f"{views} views, {leaves} leaves, {megapixels} Mpx"
@@ -79,7 +78,7 @@ def threads_lines(records: list[dict[str, Any]], rivals: dict[str, float]) -> li
     for stage, (two, _) in of["now", 2]["seconds"].items():
         wall, cpu = (" / ".join(f"{record['seconds'][stage][n]:.3g}" for record in one) for n in (0, 1))
         lines.append(f"| {stage} | {cpu} | {wall} | {two:.3g} |")
-    return lines + [f"| {name} | {seconds:.3g} | | |" for name, seconds in rivals.items()]
+    return lines
 
 
 def write_between(page: str, lines: list[str], *, name: str) -> str:

@@ -32,7 +32,6 @@ def two_views(demo_scene: Scene, demo_regions: Regions) -> tuple[Regions, Scene]
 
 @pytest.mark.slow
 def test_agrees_with_drawn_lines_better_than_two_samplings_do(two_views: tuple[Regions, Scene]) -> None:
-    """The whole shipped scene is compared by benchmarks/affinity_agreement.py."""
     regions, scene = two_views
     drawn = torch.stack([symmetric(affinity_reference(regions, scene.cameras, 200, seed)) for seed in range(3)])
     pairs = regions.view_index[:, None] != regions.view_index

@@ -1,15 +1,9 @@
-"""The page of `mvseg target`, photographed by simulation and checked: `python benchmarks/target.py OUT`
-
-A phone's camera (2016 x 1512, 26 mm as of 35 mm film, a slight pincushion) takes 11 photos round the page, which lies
-on a wooden table, from 0.4 to 0.5 m at two heights; light falls off to one side, and there are blur, noise and JPEG.
-The cameras are the true ones, and those that `mvseg pose` finds in the photos alone, with the scale of `--marker` or of
-`--distance`. `--seeds 5` repeats it with other hands, tables and noise.
+"""The page of `mvseg target`, photographed by simulation: it lies on a wooden table, light falls off to one side, and
+there are lens distortion, blur, noise and JPEG.
 """
 
 from __future__ import annotations
 
-import argparse
-import sys
 from pathlib import Path
 
 import cv2
@@ -18,25 +12,20 @@ import torch
 from scipy.spatial.transform import Rotation
 from skimage.draw import polygon2mask
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-from mvseg.cli import main as mvseg
 from mvseg.formats.board import marker_dictionary
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.rig import write_rig
-from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_corners, tag_distance
+from mvseg.formats.target import FAMILY, HEIGHT, WIDTH, list_shapes, tag_corners
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.scene_writer import write_jpeg
 
 TABLE = np.array([500, 600])  # mm; the page lies in its middle
 MIDDLE = np.array([WIDTH / 2, HEIGHT / 2])
 LARGER = 2  # photos are drawn so many times larger, and shrunk
-LENS = (0.02, -0.01)  # k1, k2
 GAMMA = 2.2
 INK = (213, 0, 120)  # sRGB
 BLACK = 0.04  # light that black toner reflects, of that of white paper
 LINEAR = (BLACK + (1 - BLACK) * (np.arange(256) / 255) ** GAMMA).astype(np.float32)
-SIZE, FOCAL = (2016, 1512), 1456.0
 
 
 def draw_page(px_per_mm: int) -> np.ndarray:
@@ -128,24 +117,3 @@ def write_photos(
     scene = Scene(name=folder.name, views=tuple(views), cameras=cameras, unit="mm", up=(0.0, 0.0, -1.0))
     write_rig(folder / "cameras.json", scene, [f"images/{view.path.name}" for view in views])
     return scene
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path, help="new folder for photos and scenes")
-    parser.add_argument("--seeds", type=int, default=1)
-    args = parser.parse_args()
-    for seed in range(args.seeds):
-        true = args.out / f"{seed}-true"
-        write_photos(true, aim_cameras(11, size=SIZE, focal=FOCAL, seed=seed), px_per_mm=8, seed=seed, lens=LENS)
-        mvseg(["check", str(true), "--target", "--quiet"])
-        scales = {"marker": [f"{TAG:g}"], "distance": ["marker:0", "marker:11", f"{tag_distance():.2f}"]}
-        for option, words in scales.items():
-            found = args.out / f"{seed}-{option}"
-            scale = [f"--{option}", *words, "--unit", "mm"]
-            mvseg(["pose", str(true / "images"), "--out", str(found), *scale, "--quiet"])
-            mvseg(["check", str(found), "--target", "--quiet"])
-
-
-if __name__ == "__main__":
-    main()
