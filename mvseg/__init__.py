@@ -48,8 +48,6 @@ if TYPE_CHECKING:
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
     from mvseg.pipeline.run_scene import run_scene as run_scene
-    from mvseg.poses.refine_poses import RefinedPoses as RefinedPoses
-    from mvseg.poses.refine_poses import refine_poses as refine_poses
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
     from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces as fit_surfaces
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface as LeafSurface
@@ -57,7 +55,6 @@ if TYPE_CHECKING:
     from mvseg.regions import Regions as Regions
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
     from mvseg.results.read import load_result as load_result
-    from mvseg.results.same_result import assert_same_result as assert_same_result
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
     from mvseg.system.running import running as running

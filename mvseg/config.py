@@ -32,8 +32,6 @@ class RunConfig:
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level, "board" from ArUco markers that lie flat; None for that of the scene.
-        refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; used only if held-out
-            leaves agree clearly better.
         split_merged: cut a mask that seems to cover two instances in two.
         report: write report.html, the result as one page.
         coco_crowd: how annotations with `iscrowd` in a COCO file are treated: "mask": as all others; "ignore": left
@@ -51,7 +49,6 @@ class RunConfig:
     scale: float | None = None
     unit: str | None = None
     up: Up | None = None
-    refine_poses: bool = False
     split_merged: bool = False
     report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"

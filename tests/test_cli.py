@@ -196,7 +196,6 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "num_restarts": 2,
             "seed": 9,
         },
-        "refine_poses": False,
         "split_merged": False,
         "coco_crowd": "mask",
         "categories": None,

@@ -394,6 +394,19 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     assert OpenResult(folder).opened.config.match == MatchConfig()
 
 
+def test_a_result_whose_poses_were_refined(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By an option of earlier versions, too; that it was off is nothing to say."""
+    out = shutil.copytree(folder, tmp_path / "result")
+    run = json.loads((out / "run.json").read_text())
+    for option in (False, True):
+        poses = {"refined": option, "residual_px": [3.142, None]}
+        changes = {"config": run["config"] | {"refine_poses": option}, "poses": poses}
+        (out / "run.json").write_text(json.dumps(run | changes))
+        assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
+        said = capsys.readouterr().err
+        assert ("its poses were refined by the masks, and will be those of the scene" in said) == option
+
+
 def test_a_result_whose_colours_a_card_corrected(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

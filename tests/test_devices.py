@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import pytest
@@ -20,7 +18,6 @@ from mvseg import (
     reconstruct_instances,
     region_affinity,
 )
-from mvseg.poses.refine_poses import refine_poses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -59,17 +56,6 @@ def test_the_answer_is_there_and_the_same(step: Callable[[Regions, Cameras, Tens
         assert answer.device == device
         assert answer.dtype == expected.dtype
         torch.testing.assert_close(answer.cpu(), expected)
-
-
-def test_poses_are_refined_there() -> None:
-    noise = torch.randn(SCENE.cameras.t.shape, generator=torch.Generator().manual_seed(0))
-    cameras = replace(SCENE.cameras, t=SCENE.cameras.t + 0.05 * noise)
-    expected = refine_poses(cameras, partial(match_regions, SCENE.regions))
-    with other_device() as device:
-        poses = refine_poses(cameras.to(device), partial(match_regions, SCENE.regions.to(device)))
-        assert poses.is_refined
-        assert poses.cameras.device == device
-        torch.testing.assert_close(poses.cameras.t.cpu(), expected.cameras.t)
 
 
 def test_the_other_device_refuses_what_a_gpu_refuses() -> None:

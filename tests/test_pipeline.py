@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 import torch
 
 import mvseg
-from found_masks import FoundMasks, open_photos, see_masks
+from found_masks import FoundMasks, see_masks
 from mvseg import (
     InputError,
     InputWarning,
@@ -44,7 +43,6 @@ from mvseg.matching.result import Matching
 from mvseg.pipeline.finish import finish, shape_leaves
 from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.open_scene import open_scene
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
@@ -93,25 +91,6 @@ def test_ids_only(plant: Path) -> None:
     result = run_scene(plant, plant / "masks", IDS_ONLY)
     assert (result.surfaces, result.voxels, result.traits) == (None, None, None)
     assert [*result.seconds] == ["load", "match", "check"]
-
-
-def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    given = load_scene(plant).cameras
-    better = replace(given, t=given.t + 0.01)
-
-    poses = RefinedPoses(cameras=better, is_refined=True, residual_px=(2.0, 0.2))
-    monkeypatch.setattr("mvseg.poses.refine_poses.refine_poses", lambda *_: poses)
-    result = run_scene(plant, plant / "masks", replace(IDS_ONLY, refine_poses=True))
-    assert result.scene.cameras is better
-    assert result.poses is poses
-    fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=128, height=96, params=[150, 150, 64, 48, 0, 0, 0, 0])
-    scene = load_scene(plant)
-    view, *others = scene.views
-    odd = replace(scene, views=(replace(view, lens=fisheye), *others))
-    given = Masks.of(load_masks(scene, plant / "masks"))
-    opened = open_photos(odd, replace(IDS_ONLY, refine_poses=True), given)
-    with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
-        assert match_given(opened).scene.cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -213,7 +192,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert run["warnings"] == ["odd"]
-        ran = {"views", "match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
+        ran = {"views", "match", "split_merged", "coco_crowd", "categories", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"

@@ -48,7 +48,7 @@ IDS = SCENE.regions.labels
 CPU = torch.device("cpu")
 # Names whose answers are tried on another device in other files, and names that take and give no tensors.
 ELSEWHERE = {
-    "EpipolarAssignment", "cluster_aware_nms", "epipolar_map", "refine_poses", "RefinedPoses", "reconstruct_instances",
+    "EpipolarAssignment", "cluster_aware_nms", "epipolar_map", "reconstruct_instances",
     "region_affinity", "MultiViewMaskRCNN", "Regions", "Cameras",
 }  # fmt: skip
 WITHOUT_TENSORS = {
@@ -58,7 +58,7 @@ WITHOUT_TENSORS = {
 }  # fmt: skip
 # They read files, or take arrays of any kind: what they make is on the CPU.
 MAKERS = {
-    "assert_same_result", "load_masks", "load_result", "load_scene", "load_photos", "load_detector", "run_scene",
+    "load_masks", "load_result", "load_scene", "load_photos", "load_detector", "run_scene",
     "regions_from_masks", "Scene",
     "regions_from_label_maps", "with_instance_ids",
 }  # fmt: skip

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.checks.numbers import IMAGES
 from mvseg.formats.masks.faults import mask_faults
-from mvseg.matching.tangency import touches_border, without_small_components
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -68,3 +69,16 @@ def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
         if reach > IMAGES.beyond * longest[view]:
             views.add(view)
     return "warning", sorted(views), "masks of {} have stray pixels far from the rest of them: remove small components"
+
+
+def touches_border(regions: Regions, cameras: Cameras) -> Tensor:
+    """(D,) bool, whether a region reaches the border of its photo, where it may be cut."""
+    return ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= cameras.sizes[regions.view_index])).any(1)
+
+
+def without_small_components(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask (H, W) without the components of less than 0.2 % of its pixels: they would be its ends."""
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    is_kept = stats[:, cv2.CC_STAT_AREA] >= IMAGES.small_component * mask.sum()
+    is_kept[0] = False
+    return is_kept[pieces].astype(np.uint8) if is_kept.any() else mask.astype(np.uint8)

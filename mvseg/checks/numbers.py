@@ -36,6 +36,7 @@ class AgreementNumbers:
     num_moves: int = 16  # moves of a view's masks, which show what chance does
     most_partners: int = 20  # limit: views that each view is compared with, about
     most_offset: int = 40  # limit: units that lines may miss by, tried in both directions
+    widest: float = 1.5  # limit, radians: part of the pencil that a mask fills; with more it holds the epipole
     sharpness: float = 2.0  # width of a vote for an offset, in units
     off: float = 0.22  # share of a view's masks that fit, below which the view agrees with none if lines miss, too
     offset: float = 1.5  # units from which lines miss
@@ -84,6 +85,7 @@ class ImageNumbers:
     tiny_px: int = 30  # pixels of a mask that carries information, at least
     many: float = 0.25  # share of the masks that are tiny or cut by the border, above which a user is told
     few: float = 0.34  # masks of a view, in their median number, below which some may be missing
+    small_component: float = 0.002  # size of a component that does not count, as a share of its mask's pixels, at most
     beyond: float = 0.1  # reach of stray pixels beyond a mask, as a share of the photo's longer side, at most
     blank: float = 4.0  # standard deviation of grey levels of a photo of nothing, at most
     blank_share: float = 0.03  # the same of a dark one, as a share of its level: photos of something have a fifth

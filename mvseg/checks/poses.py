@@ -12,16 +12,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.finding import Finding, Level, Rule, list_findings
+from mvseg.checks.masks import touches_border, without_small_components
 from mvseg.checks.numbers import AGREEMENT
-from mvseg.matching.numbers import TANGENCY
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
-from mvseg.matching.tangency import hull_corners, touches_border
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
@@ -85,7 +85,7 @@ def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
     num_views = len(cameras)
     regions, cameras = regions.to("cpu"), cameras.to("cpu")
     regions = regions.select(~touches_border(regions, cameras))
-    corners = hull_corners(regions)
+    corners = _hull_corners(regions)
     hulls = [corners[regions.view_index == view] for view in range(num_views)]
     fitting, offset = np.full((2, num_views, num_views), np.nan)
     num_masks = np.zeros((num_views, num_views), np.int64)
@@ -151,7 +151,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     missed = np.flatnonzero(view.offset_px >= AGREEMENT.offset * pairs.unit_px).tolist()
     missing = [index for index in missed if index not in view.off] if len(names) >= AGREEMENT.few_views else []
     most = view.offset_px[missing].max(initial=0)
-    step = "refine the poses, with --refine_poses true or COLMAP's bundle adjustment"
+    step = "calibrate again, or adjust the poses in COLMAP (bundle adjustment)"
     rules.append(("warning", missing, f"epipolar lines of {{}} miss by up to {most:.0f} px: {step}"))
     return list_findings("poses", rules, names)
 
@@ -179,6 +179,21 @@ def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
     return [(i, i + step) for step in dict.fromkeys(steps.tolist()) for i in range(num_views - step)]
 
 
+def _hull_corners(regions: Regions) -> Tensor:
+    """(D, P, 2) float64, the corners of the regions' hulls, pixel centres; the first is repeated where there are
+    fewer."""
+    hulls = [_hull(regions, index) for index in range(len(regions))]
+    most = max((len(hull) for hull in hulls), default=1)
+    padded = [torch.cat((hull, hull[:1].expand(most - len(hull), 2))) for hull in hulls]
+    return torch.stack(padded) if hulls else torch.zeros(0, most, 2).double()
+
+
+def _hull(regions: Regions, index: int) -> Tensor:
+    """(P, 2) float64, the corners of a region's hull, pixel centres."""
+    corners = cv2.convexHull(cv2.findNonZero(without_small_components(regions.crop(index).numpy())))[:, 0]
+    return torch.from_numpy(corners + regions.boxes[index, :2].numpy() + 0.5)
+
+
 def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
     """Begin and end of each mask that does not hold the epipole, at corners (N, P, 2) of their hulls."""
     plane = pencil.plane_from_px[side]
@@ -188,7 +203,7 @@ def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
     pitch = across.norm(dim=2) / (x.square() + y.square()).clamp(min=torch.finfo(x.dtype).tiny)
     at_ends = torch.stack((angle.argmin(1), angle.argmax(1)), 1)
     spans, pitches = angle.gather(1, at_ends), pitch.gather(1, at_ends)
-    is_span = (spans[:, 1] - spans[:, 0] < TANGENCY.widest) & (pitches > 0).all(1)
+    is_span = (spans[:, 1] - spans[:, 0] < AGREEMENT.widest) & (pitches > 0).all(1)
     return _Spans(spans[is_span], pitches[is_span])
 
 

@@ -149,8 +149,8 @@ def _print_table(check: Check) -> None:
 
 def _rows(check: Check) -> list[dict[str, Any]]:
     """The rows of the table and of check.json, one per view; None where a value is unknown."""
+    from mvseg.checks.masks import touches_border
     from mvseg.checks.poses import view_agreement
-    from mvseg.matching.tangency import touches_border
 
     num, regions = len(check.scene.views), check.regions
     counts: list[Any] = [None] * num

@@ -47,7 +47,7 @@ MOST_USED = {
               "split_merged", "num_workers", "corrections"),
     "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
               "detect.weights"),
-    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "refine_poses"),
+    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method"),
     "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",
               "epochs", "resume"),
 }  # fmt: skip

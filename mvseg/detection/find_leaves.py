@@ -54,11 +54,8 @@ class Look:
     ) -> Look:
         """A look, matched from `min_score` on with the V cameras of the photos."""
         nothing = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=len(cameras))), MatchReport("none"))
-        return Look(model, detections, boxes, nothing).with_cameras(cameras, min_score)
-
-    def with_cameras(self, cameras: Cameras, min_score: float) -> Look:
-        """The same, matched anew."""
-        return replace(self, sure=self.match(cameras, min_score))
+        look = Look(model, detections, boxes, nothing)
+        return replace(look, sure=look.match(cameras, min_score))
 
     @property
     def longest(self) -> int:

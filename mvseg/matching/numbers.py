@@ -26,14 +26,6 @@ class EpipolarNumbers:
 
 
 @dataclass(frozen=True)
-class TangencyNumbers:
-    """Epipolar lines that touch outlines."""
-
-    small_component: float = 0.002  # size of a component that does not count, as a share of its mask's pixels, at most
-    widest: float = 1.5  # limit, radians: part of the pencil that a mask fills; with more it holds the epipole
-
-
-@dataclass(frozen=True)
 class OnePerViewNumbers:
     """Clusters with one region per view: pair F1 of "one-per-view" on the same masks; 0.005 at most with fewer leaves.
 
@@ -166,7 +158,6 @@ class DoubtNumbers:
 
 
 EPIPOLAR = EpipolarNumbers()
-TANGENCY = TangencyNumbers()
 ONE_PER_VIEW = OnePerViewNumbers()
 SYMNMF = SymnmfNumbers()
 SWEEP = SweepNumbers()

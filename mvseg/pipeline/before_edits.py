@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import zlib
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,19 +18,16 @@ from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.regions import Regions
 from mvseg.results.result import Instances
-from mvseg.scene import Cameras
 from mvseg.system.running import now_running
 from mvseg.verification.choose import LeftOut
 
 MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
-FIELDS = ("matching", "instances", "proposals", "matched", "left", "poses", "disagreement")
+FIELDS = ("matching", "instances", "proposals", "matched", "left", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
-CLASSES: list[Any] = [Cameras, Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality]
-CLASSES += [RefinedPoses, Regions]
+CLASSES: list[Any] = [Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality, Regions]
 
 
 def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
@@ -42,7 +38,6 @@ def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
     torch.save(
         {
             "views": known.opened.names,
-            "cameras": known.scene.cameras,
             "known": {name: getattr(known, name) for name in FIELDS},
             "surfaces": {name: each for name, each in kept.items() if isinstance(each, LeafSurface)},
             "masks": {name: torch.from_numpy(each) for name, each in kept.items() if isinstance(each, np.ndarray)},
@@ -65,8 +60,7 @@ def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | No
             packed = torch.load(io.BytesIO(inflated), map_location="cpu", weights_only=True)
         if packed["views"] != opened.names:
             return None
-        scene = replace(opened.scene, cameras=packed["cameras"])
-        known = Known(opened=opened, scene=scene, looks=(), **packed["known"])
+        known = Known(opened=opened, looks=(), **packed["known"])
         if (kept := now_running().kept) is not None:
             kept.update(packed["surfaces"] | {name: each.numpy() for name, each in packed["masks"].items()})
         return known, packed["said"]

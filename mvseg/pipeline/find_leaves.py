@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 from torch import Tensor
 
@@ -17,9 +16,7 @@ from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
-from mvseg.poses.refine_poses import RefinedPoses, refine_scene
 from mvseg.results.result import Instances
-from mvseg.scene import Scene
 
 
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Known:
@@ -35,28 +32,25 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     Raises:
         InputError: see `detect_scene`.
     """
-    detect, scene, poses = opened.config.detect, opened.scene, None
+    detect = opened.config.detect
     with collect_warnings() as said:
         look = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache)
-        if opened.config.refine_poses:
-            scene, poses = refine_scene(scene, partial(look.match, min_score=detect.min_score))
-        found = _choose(opened, look, detect, scene=scene)
+        found = _choose(opened, look, detect)
     found = replace(found, said=tuple(said))
     boxes = found.looks[0].boxes
     if detect.image_size is None and opened.is_chosen and (boxes is None or not found.is_familiar):
 
         def see(size: int) -> Found:
-            return look_once(opened, replace(detect, image_size=size), scene=scene, cache=cache, boxes=boxes)
+            return look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes)
 
         found = choose_size(see, found)
-    return know(opened, found, scene=scene, poses=poses)
+    return know(opened, found)
 
 
 def look_once(
     opened: Opened,
     detect: DetectConfig,
     *,
-    scene: Scene,
     cache: CachedDetections | None,
     boxes: Tensor | None = None,
 ) -> Found:
@@ -65,23 +59,20 @@ def look_once(
     Args:
         opened: the scene.
         detect: which detector, and at which size.
-        scene: the same with its final cameras.
         cache: of the detections.
         boxes: see `detect_scene`.
     """
     with collect_warnings() as said:
         look = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        found = _choose(opened, look, detect, scene=scene)
+        found = _choose(opened, look, detect)
     return replace(found, said=tuple(said))
 
 
-def _choose(opened: Opened, look: Look, detect: DetectConfig, *, scene: Scene) -> Found:
-    if scene.cameras is not opened.scene.cameras:
-        look = look.with_cameras(scene.cameras, detect.min_score)
-    return find_leaves([look], scene.cameras, config=detect, splits=opened.is_cut)
+def _choose(opened: Opened, look: Look, detect: DetectConfig) -> Found:
+    return find_leaves([look], opened.scene.cameras, config=detect, splits=opened.is_cut)
 
 
-def know(opened: Opened, found: Found, *, scene: Scene, poses: RefinedPoses | None) -> Known:
+def know(opened: Opened, found: Found) -> Known:
     """What is known once a look is chosen; warns of what there is to say of it."""
     for sentence in found.said:
         warn(sentence)
@@ -90,14 +81,12 @@ def know(opened: Opened, found: Found, *, scene: Scene, poses: RefinedPoses | No
     matching = Matching(found.matched[0], found.report)
     known = Known(
         opened=opened,
-        scene=scene,
         matching=matching,
         instances=Instances(),
         proposals=found.proposals,
         matched=found.matched,
         looks=found.looks,
         left=(),
-        poses=poses,
         disagreement=describe_disagreement(matching, opened.names),
     )
     return known.with_leaves(found.leaves) if opened.is_chosen else known

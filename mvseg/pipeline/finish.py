@@ -77,7 +77,6 @@ def shape_leaves(known: Known) -> Result:
         instances=replace(known.instances, surfaces=surfaces),
         photos=opened.photos,
         left=left,
-        poses=known.poses,
         mask_kind=opened.mask_kind,
         num_moved=num_moved,
         views_left_out=opened.views_left_out,

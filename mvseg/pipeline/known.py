@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,6 @@ from mvseg.matching.match import describe_disagreement, match_masks
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.open_scene import Opened
-from mvseg.poses.refine_poses import RefinedPoses, refine_scene
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
@@ -35,14 +34,12 @@ class Known:
 
     Attributes:
         opened: the scene as it was opened.
-        scene: the same, with refined cameras where they were asked for, and are better.
         matching: the masks with their ids, and what matching says of the scene.
         instances: `starts` and `probabilities` of those that the views chose; nothing else.
         proposals: R masks on the CPU, the excessive set of the detector; those that were given.
         matched: tables of masks of it that are matched, the sure ones first; () where masks were given.
         looks: that it was proposed in; () where masks were given.
         left: candidates that the views did not choose.
-        poses: what came of refining the cameras; None: nobody asked for it.
         edits: what came of a person's edits; () without any.
         refused: pixels where a person says that no leaf is, and where no mask is.
         learned: by the detector from this scene.
@@ -50,18 +47,21 @@ class Known:
     """
 
     opened: Opened
-    scene: Scene
     matching: Matching
     instances: Instances
     proposals: Masks
     matched: tuple[Masks, ...]
     looks: tuple[Look, ...]
     left: tuple[LeftOut, ...]
-    poses: RefinedPoses | None
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
     learned: Learned = NOTHING_LEARNED
     disagreement: str = ""
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with the views that were taken."""
+        return self.opened.scene
 
     @property
     def masks(self) -> Masks:
@@ -117,23 +117,18 @@ class Known:
 
 def match_given(opened: Opened) -> Known:
     """The same id for given masks of the same leaf, see `match_masks`."""
-    config, scene, given, poses = opened.config, opened.scene, opened.given, None
+    given = opened.given
     assert given is not None, "expected a scene with masks"
     with timed("match"):
-        match = partial(match_masks, given, config=config.match)
-        if config.refine_poses:
-            scene, poses = refine_scene(scene, match)
-        matching = match(scene.cameras)
+        matching = match_masks(given, opened.scene.cameras, config=opened.config.match)
     known = Known(
         opened=opened,
-        scene=scene,
         matching=matching,
         instances=Instances(),
         proposals=given.to("cpu"),
         matched=(),
         looks=(),
         left=(),
-        poses=poses,
         disagreement=describe_disagreement(matching, opened.names),
     )
     return known.cut_merged()

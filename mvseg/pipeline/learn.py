@@ -113,9 +113,9 @@ def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Kn
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
-    found = look_once(opened, detect, scene=known.scene, cache=cache, boxes=look.boxes)
+    found = look_once(opened, detect, cache=cache, boxes=look.boxes)
     with collect_warnings():
-        seen = know(opened, found, scene=known.scene, poses=known.poses)
+        seen = know(opened, found)
     return replace(seen, learned=Learned(weights=path.read_bytes()))
 
 

@@ -82,25 +82,8 @@ class TableNumbers:
     off_middle: float = 0.01  # the same of principal points of phones, cameras and webcams, of the photo's longer side
 
 
-@dataclass(frozen=True)
-class RefineNumbers:
-    """Poses that are refined by masks. Deviations are in units: pixels, or more in large photos."""
-
-    rounds: int = 3  # limit: rounds of refining and matching again
-    least_residual_px: float = 1.0  # residual of the given poses, at least: a smaller one is the masks' own error
-    clear: float = 0.8  # residual of refined poses, as a share of that of the given ones, at most
-    loss: float = 0.02  # loss of the mean match score that does not count as one
-    steps: int = 20  # limit: steps of Gauss-Newton
-    converged: float = 0.02  # limit: largest part of a step, in units, at which they end
-    pose_sd: float = 10.0  # standard deviation of poses, along each axis
-    growth_sd: float = 2.0  # the same of how tightly a mask is drawn
-    least_sd: float = 0.5  # the same of residuals, at least
-    doubted: float = 2.0  # standard deviations from which a residual is doubted
-    folds: int = 5  # parts of the instances that are held out in turn
-
 
 STRUCTURE = StructureNumbers()
 VIDEO = VideoNumbers()
 WORLD = WorldNumbers()
 TABLE = TableNumbers()
-REFINE = RefineNumbers()

@@ -7,7 +7,6 @@ Numbers in files are instance ids: label 3, `leaf_003.ply`, leaf 3 in `traits.cs
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,9 +21,7 @@ from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.formats.coco import write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
-from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.photos import Photos
-from mvseg.formats.rig import write_rig
 from mvseg.formats.run_lengths import encode_mask
 from mvseg.masks import Origin
 from mvseg.results.earlier import RESULT, Output, replace_result
@@ -39,7 +36,6 @@ from mvseg.system.running import progress_bar
 
 REPORT_FILE = "report.html"
 BEFORE_EDITS_FILE = "before_edits.bin"  # see `mvseg.pipeline.before_edits`
-CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
@@ -77,8 +73,6 @@ def save_result(
             from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
 
             write_plant(result, folder)
-        if result.poses is not None and result.poses.is_refined:
-            write_refined(folder / CAMERAS_FILE, result.scene)
         if result.learned.weights is not None:
             (folder / DETECTOR_FILE).write_bytes(result.learned.weights)
         if result.before_edits is not None:
@@ -90,7 +84,7 @@ def save_result(
 
 
 def describe_result(result: Result) -> dict[str, Any]:
-    """What run.json says of the outcome of a run: of the scene, matching, poses, traits and corrections; counts and
+    """What run.json says of the outcome of a run: of the scene, matching, traits and corrections; counts and
     timings."""
     report, scene = result.matching.report, result.scene
     shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]
@@ -111,9 +105,6 @@ def describe_result(result: Result) -> dict[str, Any]:
             "view_explained": shares,
         },
     }
-    if (poses := result.poses) is not None:
-        residuals = [_or_none(round(residual, 3)) for residual in poses.residual_px]
-        said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}
     if (traits := result.traits) is not None:
         said["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
     if (learned := result.learned).expected_right:
@@ -225,12 +216,3 @@ def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
 def _chance_of(result: Result, instance: int) -> float | None:
     """How likely an instance is a leaf, where the views chose it."""
     return result.instances.probabilities.get(instance)
-
-
-def write_refined(path: Path, scene: Scene) -> None:
-    """Write a rig file of the refined cameras, to be used instead of the scene's camera file; nothing, if a rig file
-    cannot hold one of the lenses."""
-    paths = [str(view.path) for view in scene.views]
-    root = os.path.commonpath(paths if scene.source is None else [str(scene.source), *paths])
-    if all(opencv_distortion(view.lens) is not None for view in scene.views):
-        write_rig(path, scene, [Path(os.path.relpath(photo, root)).as_posix() for photo in paths])

@@ -30,7 +30,6 @@ from mvseg.formats.lens import undistort
 from mvseg.formats.run_lengths import Rle, decode_crop, decode_rle
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.results.earlier import RUN_FILE
 from mvseg.results.folder import CORRECTED
@@ -156,10 +155,6 @@ def load_result(folder: Path | str) -> Result:
         scene = _scene_of(folder, run, content.images)
         masks = _table_of(content, scene)
     traits = _traits_of(folder, run, scene)
-    poses = None
-    if run.poses is not None:
-        before, after = (math.nan if each is None else each for each in run.poses.residual_px)
-        poses = RefinedPoses(cameras=scene.cameras, is_refined=run.poses.refined, residual_px=(before, after))
     source = run.config.get("corrections")
     edits = {"format": EDITS_FORMAT, "edits": run.edits}
     instances = _instances_of(folder, run, content, traits=traits)
@@ -168,7 +163,6 @@ def load_result(folder: Path | str) -> Result:
         scene=scene,
         matching=Matching(masks, _report_of(run)),
         instances=instances,
-        poses=poses,
         learned=load_learned(folder, run),
         seconds=run.seconds,
         mask_kind=run.mask_kind or "",

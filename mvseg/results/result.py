@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, TypeVar
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 
@@ -98,7 +97,7 @@ class Result:
     """Everything known about one scene.
 
     Attributes:
-        scene: the scene with the views that were taken, with refined cameras where `poses` has them.
+        scene: the scene with the views that were taken.
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
@@ -106,7 +105,6 @@ class Result:
         missing: leaves that the detector probably missed.
         disagreement: a sentence, where the views hardly agree and ids may be wrong; "" elsewhere.
         contradictions: what the masks and the photos say against the cameras.
-        poses: outcome of their refinement; None if it was not requested.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
         num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
@@ -128,7 +126,6 @@ class Result:
     missing: Missing | None = None
     disagreement: str = ""
     contradictions: tuple[Finding, ...] = ()
-    poses: RefinedPoses | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""
     num_moved: int | None = None

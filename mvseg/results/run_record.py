@@ -29,13 +29,6 @@ class MatchingRecord(_Part):
     view_explained: tuple[float | None, ...] | None = None
 
 
-class PosesRecord(_Part):
-    """See `RefinedPoses`."""
-
-    refined: bool
-    residual_px: tuple[float | None, float | None]
-
-
 class TraitsRecord(_Part):
     """The world that traits were measured in."""
 
@@ -71,7 +64,6 @@ class RunRecord(_Part):
     matched_by: str = "none"
     residual_px: int | None = None
     matching: MatchingRecord = MatchingRecord()
-    poses: PosesRecord | None = None
     traits: TraitsRecord | None = None
     edits: Items[Any] = []
     corrections: tuple[Fate, ...] = ()

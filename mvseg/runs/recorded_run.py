@@ -20,6 +20,7 @@ from mvseg.system.file_hash import hash_files
 
 GONE = {  # options of earlier versions: what to say of a result that was made with one
     "color_card": "its colours were corrected by a colour card, and will be those of the photos as they are now.",
+    "refine_poses": "its poses were refined by the masks, and will be those of the scene.",
 }
 READ = ("scene", "masks", "corrections")
 PLACES = (*READ, "out")  # of run.json's config: what the run read and wrote
@@ -112,7 +113,7 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
         elif hash_files(path) != sha256:
             changes.append(f"{path}: has changed since this result was made.")
     changes += _list_other_photos(folder, said)
-    changes += [f"{folder}: {change}" for name, change in GONE.items() if said.config.get(name) is not None]
+    changes += [f"{folder}: {change}" for name, change in GONE.items() if said.config.get(name)]
     return changes
 
 

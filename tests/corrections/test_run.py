@@ -18,6 +18,7 @@ from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunC
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, load_corrections, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
+from mvseg.formats.rig import write_rig
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
@@ -25,7 +26,6 @@ from mvseg.matching.split import split_merged
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.known import match_given
 from mvseg.pipeline.open_scene import open_scene
-from mvseg.results.folder import write_refined
 from mvseg.results.result import Result
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
@@ -183,7 +183,8 @@ def test_surfaces_do_not_move_a_corrected_mask(origin: Origin) -> None:
 def test_two_outlines_of_one_leaf_show_it_in_all_views(tmp_path: Path) -> None:
     (tmp_path / "plant").mkdir()
     leafy = write_leafy_scene(tmp_path / "plant", num_leaves=2, num_views=5, size=160, span_deg=180)
-    write_refined(tmp_path / "plant" / "cameras.json", leafy.scene)
+    photos = [view.path.relative_to(tmp_path / "plant").as_posix() for view in leafy.scene.views]
+    write_rig(tmp_path / "plant" / "cameras.json", leafy.scene, photos)
     folder, edits = tmp_path / "masks", []
     folder.mkdir()
     for view, name in enumerate(each.name for each in leafy.scene.views):

@@ -25,10 +25,9 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
-from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.formats.scene_folder import load_masks
 from mvseg.masks import MergedMask
 from mvseg.pipeline.run_scene import run_scene
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RESULT, check_out, replace_result
@@ -104,45 +103,6 @@ def files_below(folder: Path) -> set[str]:
 
 def read_rows(folder: Path) -> list[dict[str, str]]:
     return list(csv.DictReader((folder / "traits_wide.csv").read_text().splitlines()))
-
-
-def with_poses(result: Result, *, is_refined: bool) -> Result:
-    """As if its cameras had been refined, or had been left as they were."""
-    scene = result.scene
-    if is_refined:
-        scene = replace(scene, cameras=replace(scene.cameras, t=scene.cameras.t + 0.1))
-    residuals = (3.14159, 0.5) if is_refined else (float("nan"), float("nan"))
-    poses = RefinedPoses(cameras=scene.cameras, is_refined=is_refined, residual_px=residuals)
-    return replace(ids_only(result), scene=scene, poses=poses)
-
-
-def test_refined_cameras_can_be_read_back(result: Result, plant: Path, tmp_path: Path) -> None:
-    """In the place of those that the scene had: lens, photos, unit and all."""
-    refined = with_poses(result, is_refined=True)
-    save_result(refined, tmp_path / "out", {}, report=False)
-    run = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert run["poses"] == {"refined": True, "residual_px": [3.142, 0.5]}
-    assert "cameras.json" in run["files"]
-    again = shutil.copytree(plant, tmp_path / "plant")
-    shutil.copy(tmp_path / "out" / "cameras.json", again)
-    scene = load_scene(again)
-    assert [view.name for view in scene.views] == [view.name for view in refined.scene.views]
-    assert all(view.path.is_file() for view in scene.views)
-    assert scene.unit == "mm"
-    for name in ("K", "R", "t", "sizes"):
-        assert torch.equal(getattr(scene.cameras, name), getattr(refined.scene.cameras, name))
-    lens, expected = scene.views[DISTORTED].lens, refined.scene.views[DISTORTED].lens
-    assert lens is not None
-    assert expected is not None
-    assert lens.params.tolist() == expected.params.tolist()
-
-
-def test_poses_that_stay_are_not_written(result: Result, tmp_path: Path) -> None:
-    save_result(with_poses(result, is_refined=False), tmp_path / "out", {})
-    assert files_below(tmp_path / "out") == IDS_FILES
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["poses"] == {
-        "refined": False, "residual_px": [None, None]
-    }  # fmt: skip
 
 
 def label_of_balls(folder: Path, plant: Path) -> list[list[int]]:

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from known_leaves import bent_blade, make_surface
-from mvseg import assert_same_result, load_result
+from mvseg import load_result
 from mvseg.config import RunConfig
 from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import Corrections, Reject
@@ -29,7 +29,6 @@ from mvseg.formats.run_lengths import decode_crop, decode_rle, encode_mask
 from mvseg.masks import MergedMask, Origin
 from mvseg.matching.result import MatchReport
 from mvseg.pipeline.run_scene import run_scene
-from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.regions import mask_box
@@ -38,6 +37,7 @@ from mvseg.results.result import Instances, Result
 from mvseg.results.shapes_file import write_surfaces
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
+from same_result import assert_same_result
 from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
 
 LAWFUL = ("instances.json", "traits.csv", "surfaces.npz", "voxels.npz")  # the same bytes again
@@ -64,7 +64,7 @@ def balls(plant: Path) -> Result:
 @pytest.fixture(scope="module")
 def rich(balls: Result) -> Result:
     """Something of everything that a result may hold: a surface, one with doubts, voxels, and a leaf without a shape;
-    masks of every origin, one of two leaves, one unmatched; corrections, and refined poses."""
+    masks of every origin, one of two leaves, one unmatched; and corrections."""
     part = torch.zeros_like(balls.regions.crop(3))
     part[: len(part) // 2] = True
     masks = balls.masks.with_merged([MergedMask(region=3, own=int(balls.masks.instance_ids[3]), other=3, part=part)])
@@ -88,7 +88,6 @@ def rich(balls: Result) -> Result:
         scene=scene,
         matching=matching,
         instances=Instances({1: 0.98765, 2: 0.5}, surfaces=surfaces, voxels=voxels, traits=traits),
-        poses=RefinedPoses(scene.cameras, is_refined=True, residual_px=(3.14159, math.nan)),
         seconds={"match": 1.23456},
         mask_kind="label images",
         num_moved=2,

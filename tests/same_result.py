@@ -55,7 +55,6 @@ def assert_same_result(
     _check("has traits", first.traits is None, second.traits is None)
     if first.traits is not None and second.traits is not None:
         _compare_traits(first.traits, second.traits, numbers, relative)
-    _check("refined poses", first.poses and first.poses.is_refined, second.poses and second.poses.is_refined)
     _check("moved masks", first.num_moved, second.num_moved)
     _check("fates of corrections", first.fates, second.fates)
     edits = [() if each.corrections is None else each.corrections.edits for each in (first, second)]
