@@ -37,10 +37,9 @@ class Origin(IntEnum):
     GIVEN = 0  # the user's
     DETECTED = 1
     OTHER_VIEWS = 2  # no detector found it: surfaces fitted to the masks of other views show it
-    FEW_VIEWS = 3  # a detector found it in too few views to be verified
-    CORRECTED = 4  # a person drew it; from here on, no stage changes or drops a mask
-    CUT = 5  # a person cut it from another one
-    CONFIRMED = 6  # a person says that it is right, with the edge that photos give it
+    CORRECTED = 3  # a person drew it; from here on, no stage changes or drops a mask
+    CUT = 4  # a person cut it from another one
+    CONFIRMED = 5  # a person says that it is right, with the edge that photos give it
 
 
 @dataclass(frozen=True, eq=False)

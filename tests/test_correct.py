@@ -39,7 +39,7 @@ from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
-from mvseg.runs.recorded_run import read_recorded
+from mvseg.runs.recorded_run import GONE, read_recorded
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
@@ -394,17 +394,24 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     assert OpenResult(folder).opened.config.match == MatchConfig()
 
 
-def test_a_result_whose_poses_were_refined(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """By an option of earlier versions, too; that it was off is nothing to say."""
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"refine_poses": False, "detect": {"min_views": 2}}, None),  # as everybody had them
+        ({"refine_poses": True}, "its poses were refined by the masks, and will be those of the scene"),
+        ({"detect": {"min_views": 1}}, "it has leaves by another number of photos"),
+    ],
+)
+def test_a_result_made_with_options_that_are_gone(
+    options: dict[str, Any], sentence: str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = shutil.copytree(folder, tmp_path / "result")
     run = json.loads((out / "run.json").read_text())
-    for option in (False, True):
-        poses = {"refined": option, "residual_px": [3.142, None]}
-        changes = {"config": run["config"] | {"refine_poses": option}, "poses": poses}
-        (out / "run.json").write_text(json.dumps(run | changes))
-        assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
-        said = capsys.readouterr().err
-        assert ("its poses were refined by the masks, and will be those of the scene" in said) == option
+    (out / "run.json").write_text(json.dumps(run | {"config": run["config"] | options}))
+    assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
+    said = capsys.readouterr().err
+    assert (sentence or "") in said
+    assert sentence or not any(change in said for _, change in GONE.values())
 
 
 def test_a_result_whose_colours_a_card_corrected(

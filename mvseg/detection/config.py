@@ -29,8 +29,6 @@ class DetectConfig:
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
         verify: let the views choose leaves and masks from everything that the detector proposes, weak proposals
             included, by one score (`mvseg.verification.choose`). It was fitted on leaves.
-        min_views: a leaf must have masks in so many photos. 1 keeps, too, what one or two photos show and no other view
-            verifies: as it was found, and marked.
     """
 
     weights: str = "leaf-lite"
@@ -40,7 +38,6 @@ class DetectConfig:
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
     verify: bool = True
-    min_views: int = 2
 
     def __post_init__(self) -> None:
         check_choices(self, "detect")
@@ -53,5 +50,3 @@ class DetectConfig:
             raise InputError(f"detect.image_size is {self.image_size}, expected {expected}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")
-        if self.min_views < 1:
-            raise InputError(f"detect.min_views is {self.min_views}, expected 1 or more")

@@ -105,7 +105,7 @@ def _detect(
 def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
     """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
     options = asdict(config) | {"weights": hash_files(weights_path(config.weights))}
-    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None, "min_probability": None}
+    options |= {"num_iterations": None, "verify": None, "crop": None, "min_probability": None}
     options |= {"min_score": min(DETECTION.least_score, config.min_score) if config.verify else config.min_score}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

@@ -23,7 +23,6 @@ class DetectionNumbers:
     most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
     mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
-    few_views: int = 2  # views of a leaf that is added as it was found, at most
     plant_views: int = 3  # views of an instance that is part of the plant, at least; all where there are fewer
     plant_margin: float = 0.1  # margin around the plant, as a share of its box's longer side: missed leaves
     least_gain: float = 1.5  # size of the plant in a second pass, in that of the first, at least, in most photos

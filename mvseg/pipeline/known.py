@@ -103,11 +103,8 @@ class Known:
 
     def with_leaves(self, leaves: Leaves) -> Known:
         """The same with the leaves that the views chose."""
-        from mvseg.detection.few_views import select_by_views
-
-        masks = select_by_views(leaves.masks, self.masks, min_views=self.opened.config.detect.min_views)
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
-        return replace(self, instances=instances, left=leaves.left).with_masks(masks)
+        return replace(self, instances=instances, left=leaves.left).with_masks(leaves.masks)
 
     def cut_merged(self) -> Known:
         """Masks that show two leaves are cut, where that is asked for; surfaces know best which ones do, so where they

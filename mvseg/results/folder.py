@@ -179,8 +179,6 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         source["score"] = round(score, 4)
     if origin in (Origin.DETECTED, Origin.OTHER_VIEWS):
         source["from_other_views"] = origin == Origin.OTHER_VIEWS
-    if origin == Origin.FEW_VIEWS:
-        source["from_few_views"] = True
     if origin in CORRECTED:
         source["corrected"] = CORRECTED[origin]
     return {

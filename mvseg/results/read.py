@@ -80,7 +80,6 @@ class _Mask(BaseModel):
     probability: FiniteFloat | None = None
     source_label: Int64 | None = None
     from_other_views: bool = False
-    from_few_views: bool = False
     corrected: Literal["outline", "split", "confirm"] | None = None
     other_instance_id: int = Field(-1, ge=-1, le=MOST_INSTANCES)
     other_part: Rle | None = None
@@ -92,8 +91,6 @@ class _Mask(BaseModel):
             return {edit: origin for origin, edit in CORRECTED.items()}[self.corrected]
         if self.source_label is not None:
             return Origin.GIVEN
-        if self.from_few_views:
-            return Origin.FEW_VIEWS
         return Origin.OTHER_VIEWS if self.from_other_views else Origin.DETECTED
 
 

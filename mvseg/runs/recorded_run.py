@@ -18,9 +18,11 @@ from mvseg.results.earlier import RUN_FILE, path_from
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.system.file_hash import hash_files
 
-GONE = {  # options of earlier versions: what to say of a result that was made with one
-    "color_card": "its colours were corrected by a colour card, and will be those of the photos as they are now.",
-    "refine_poses": "its poses were refined by the masks, and will be those of the scene.",
+# Options of earlier versions: what they were by default, and what to say of a result that was made with another value.
+GONE: dict[str, tuple[Any, str]] = {
+    "color_card": (None, "its colours were corrected by a colour card, and will be those of the photos."),
+    "detect.min_views": (2, "it has leaves by another number of photos, and will have those that two or more show."),
+    "refine_poses": (False, "its poses were refined by the masks, and will be those of the scene."),
 }
 READ = ("scene", "masks", "corrections")
 PLACES = (*READ, "out")  # of run.json's config: what the run read and wrote
@@ -113,8 +115,16 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
         elif hash_files(path) != sha256:
             changes.append(f"{path}: has changed since this result was made.")
     changes += _list_other_photos(folder, said)
-    changes += [f"{folder}: {change}" for name, change in GONE.items() if said.config.get(name)]
+    before = {name: _option(said, name) for name in GONE}
+    changes += [f"{folder}: {what}" for name, (usual, what) in GONE.items() if before[name] not in (None, usual)]
     return changes
+
+
+def _option(said: RunRecord, name: str) -> Any:
+    """An option of the run; None where it had none of the name."""
+    stage, _, own = name.rpartition(".")
+    inside = said.config.get(stage) if stage else said.config
+    return inside.get(own) if isinstance(inside, dict) else None
 
 
 def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
@@ -139,7 +149,13 @@ def _is_file_below(place: Path, name: str) -> bool:
 
 def _read_config(folder: Path, said: RunRecord) -> RunConfig:
     """The options of the stages."""
-    options = {name: value for name, value in said.config.items() if name not in (*PLACES, *GONE, "from_here")}
+    options = {
+        stage: {name: each for name, each in value.items() if f"{stage}.{name}" not in GONE}
+        if isinstance(value, dict)
+        else value
+        for stage, value in said.config.items()
+        if stage not in (*PLACES, *GONE, "from_here")
+    }
     known = asdict(RunConfig())
     unknown = [name for name in options if name not in known]
     for stage, inside in options.items():

@@ -108,7 +108,7 @@ def are_labels(masks: Masks, probabilities: Mapping[int, float]) -> Tensor:
     Returns:
         (D,) bool.
     """
-    is_seen = ~torch.isin(masks.origin, torch.tensor([Origin.OTHER_VIEWS, Origin.FEW_VIEWS]))
+    is_seen = masks.origin != Origin.OTHER_VIEWS
     unlikely = torch.tensor([each for each, chance in probabilities.items() if chance < LIKELY], dtype=torch.int64)
     is_likely = (masks.instance_ids > 0) & ~torch.isin(masks.instance_ids, unlikely)
     return masks.is_corrected | (is_likely & is_seen & (masks.match_scores >= SURE))

@@ -43,7 +43,7 @@ def test_what_says_what_is_seen_changes_no_leaf() -> None:
         ({"cannot": [(ONE[0], ONE[2])]}, [2, 3]),
         ({"whole": (Whole(1, TWO[0], True),)}, [1, 3]),
         ({"masks": NAMED.select(torch.arange(len(IDS)) != THREE[1])}, [1, 2]),
-        ({"before": replace(BEFORE, origin=BEFORE.origin.where(IDS != 1, int(Origin.FEW_VIEWS)))}, [2, 3]),
+        ({"before": replace(BEFORE, origin=BEFORE.origin.where(IDS != 1, int(Origin.OTHER_VIEWS)))}, [2, 3]),
         ({"before": replace(BEFORE, instance_ids=IDS.where(torch.arange(len(IDS)) != ONE[0], -1))}, [1, 2, 3]),
         (
             {

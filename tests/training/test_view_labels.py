@@ -42,7 +42,6 @@ def chosen(ids: list[int], scores: list[float], origins: list[Origin]) -> Masks:
         (1, 0.9, None, Origin.GIVEN, True),  # nobody asked whether it is a leaf
         (-1, 0.9, None, Origin.DETECTED, False),
         (1, 0.9, 0.9, Origin.OTHER_VIEWS, False),
-        (1, 0.9, 0.9, Origin.FEW_VIEWS, False),
         (-1, 0.0, None, Origin.CORRECTED, True),
         (1, 0.1, 0.1, Origin.CONFIRMED, True),
     ],

@@ -138,7 +138,7 @@ def test_masks_of_one_photo_do_not_grow_into_each_other() -> None:
         assert min(iou(one, labels == 1), iou(other, labels == 2)) > 0.97
 
 
-@pytest.mark.parametrize("origin", [Origin.GIVEN, Origin.CORRECTED, Origin.OTHER_VIEWS, Origin.FEW_VIEWS])
+@pytest.mark.parametrize("origin", [Origin.GIVEN, Origin.CORRECTED, Origin.OTHER_VIEWS])
 def test_masks_that_no_detector_found_stay(origin: Origin) -> None:
     labels, regions = two_leaves()
     masks = Masks.of(regions, torch.tensor([1, 2, 1, 2]), origin=Origin.DETECTED)
