@@ -46,7 +46,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.open_scene import Opened
 from mvseg.results.overlay import draw_overlay

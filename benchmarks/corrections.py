@@ -48,7 +48,7 @@ from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import open_scene

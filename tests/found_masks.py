@@ -47,4 +47,4 @@ def open_photos(scene: Scene, config: RunConfig = RunConfig(), given: Masks | No
 
 def see_masks(monkeypatch: Any, look: Any) -> None:
     """The detector sees this look in every scene."""
-    monkeypatch.setattr("mvseg.pipeline.find_leaves.detect_scene", lambda *_, **__: look)
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.detect_scene", lambda *_, **__: look)

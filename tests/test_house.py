@@ -13,6 +13,7 @@ import tomllib
 import zipfile
 from collections.abc import Callable
 from dataclasses import fields
+from graphlib import CycleError, TopologicalSorter
 from importlib.util import resolve_name
 from pathlib import Path
 from types import ModuleType
@@ -64,11 +65,8 @@ def room_of(module: str) -> str:
     return [*module.split("."), "__init__"][1]
 
 
-def imported_rooms(source: str, module: str) -> set[str]:
-    """Rooms that a module imports, anywhere in it: in functions, in `if TYPE_CHECKING` and by relative imports, too.
-
-    `from mvseg import x` imports `__init__`, whatever x is: names of rooms and public names look alike there.
-    """
+def imported_modules(source: str, module: str) -> set[str]:
+    """What a module imports, anywhere in it: in functions, in `if TYPE_CHECKING` and by relative imports, too."""
     package = module.rpartition(".")[0]
     imported: set[str] = set()
     for node in ast.walk(ast.parse(source)):
@@ -76,7 +74,15 @@ def imported_rooms(source: str, module: str) -> set[str]:
             imported.update(name.name for name in node.names)
         elif isinstance(node, ast.ImportFrom):
             imported.add(resolve_name("." * node.level + (node.module or ""), package))
-    return {room_of(name) for name in imported if name.split(".")[0] == "mvseg"}
+    return imported
+
+
+def imported_rooms(source: str, module: str) -> set[str]:
+    """Rooms that a module imports.
+
+    `from mvseg import x` imports `__init__`, whatever x is: names of rooms and public names look alike there.
+    """
+    return {room_of(name) for name in imported_modules(source, module) if name.split(".")[0] == "mvseg"}
 
 
 def forbidden_rooms(source: str, module: str) -> set[str]:
@@ -110,6 +116,15 @@ def test_imports_go_one_way() -> None:
     assert {room_of(module) for module in MODULES} <= FLOOR_OF.keys()
     forbidden = {module: forbidden_rooms(source, module) for module, source in MODULES.items()}
     assert {module: rooms for module, rooms in forbidden.items() if rooms} == {}
+
+
+def test_no_two_modules_need_each_other() -> None:
+    """Inside of rooms, too, and for types alone; `__init__` of a room takes from its modules, which is no circle."""
+    imports = {module: imported_modules(source, module) & MODULES.keys() for module, source in MODULES.items()}
+    rooms = {module for module in MODULES if module.endswith("__init__")}
+    TopologicalSorter({module: imports[module] for module in MODULES.keys() - rooms}).prepare()  # raises CycleError
+    with pytest.raises(CycleError):
+        TopologicalSorter({"a": {"b"}, "b": {"c"}, "c": {"a"}}).prepare()
 
 
 def test_every_module_is_imported_by_another() -> None:

@@ -21,7 +21,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import learn as module
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.learn import learn

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -23,8 +23,17 @@ from mvseg.verification.choose import Leaves, choose_leaves
 from mvseg.verification.leaf_scores import expect_right
 from mvseg.verification.unexplained import is_familiar
 
-if TYPE_CHECKING:
-    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+
+class Detector(Protocol):
+    """What a look needs of its detector, a `MultiViewMaskRCNN`."""
+
+    transform: Any  # torchvision's
+
+    def parameters(self) -> Iterator[Tensor]: ...
+
+    def match_detections(
+        self, detections: Sequence[dict[str, Tensor]], cameras: Cameras, *, min_score: float
+    ) -> Matching: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,14 +47,14 @@ class Look:
         sure: the proposals that score enough to be matched at first, matched, see `match`.
     """
 
-    model: MultiViewMaskRCNN
+    model: Detector
     detections: Sequence[dict[str, Tensor]]
     boxes: Tensor | None
     sure: Matching
 
     @staticmethod
     def of(
-        model: MultiViewMaskRCNN,
+        model: Detector,
         detections: Sequence[dict[str, Tensor]],
         cameras: Cameras,
         *,

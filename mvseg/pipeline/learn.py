@@ -27,7 +27,7 @@ from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_leaves import know, look_once
+from mvseg.pipeline.find_in_photos import know, look_once
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole

@@ -65,7 +65,7 @@ def run_scene(
             if opened.given is not None:
                 known = match_given(opened)
             else:
-                from mvseg.pipeline.find_leaves import find_in_photos  # loads torchvision
+                from mvseg.pipeline.find_in_photos import find_in_photos  # loads torchvision
                 from mvseg.pipeline.learn import learn
 
                 kept = CachedDetections(Path(cache or place))

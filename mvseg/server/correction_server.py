@@ -17,7 +17,6 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from mvseg.corrections.file import Corrections, load_corrections, name_edits, parse_corrections, write_corrections
 from mvseg.errors import InputError
-from mvseg.server.local_server import Refused
 from mvseg.system.running import Cancelled, running
 
 CORRECTIONS_FILE = "corrections.json"
@@ -26,6 +25,14 @@ LOOK_SECONDS = 1.0  # until it looks again whether another program has changed t
 STEP_SECONDS = 1.0  # between two words of what is computed
 LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
 CHANGED = "corrections.json was changed by another program since this page was loaded."
+
+
+class Refused(Exception):
+    """A request that is not answered, with the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
 
 
 class Opened(Protocol):

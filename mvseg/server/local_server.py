@@ -14,24 +14,14 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
-
-if TYPE_CHECKING:
-    from mvseg.server.correction_server import Corrector
+from mvseg.server.correction_server import Corrector, Refused
 
 HOST = "127.0.0.1"
-
-
-class Refused(Exception):
-    """A request that is not answered, with the status and a sentence."""
-
-    def __init__(self, status: HTTPStatus, sentence: str) -> None:
-        super().__init__(sentence)
-        self.status = status
 
 
 class CorrectionServer(ThreadingHTTPServer):

@@ -31,7 +31,7 @@ from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import unpack_known
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.learn import learn

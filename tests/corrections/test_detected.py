@@ -20,7 +20,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import MOST_BYTES, pack_known, unpack_known
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras, Scene, View

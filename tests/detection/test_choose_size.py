@@ -20,7 +20,7 @@ from mvseg.detection.find_leaves import find_leaves
 from mvseg.errors import warn
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.verification.leaf_scores import expect_right
 
 
@@ -90,7 +90,7 @@ def test_looks_that_are_thrown_away_are_not_spoken_of(monkeypatch: pytest.Monkey
         warn(f"at {config.image_size}")
         return look_of(squares(9), longest=64)
 
-    monkeypatch.setattr("mvseg.pipeline.find_leaves.detect_scene", detect)
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.detect_scene", detect)
     with pytest.warns(UserWarning, match=f"at {size}") as caught:
         find_in_photos(open_photos(load_scene(demo_scene()), RunConfig(detect=DetectConfig(image_size=size))))
     assert asked == ([300] if size else [None, 45])

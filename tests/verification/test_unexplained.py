@@ -18,7 +18,7 @@ from mvseg.corrections.corrected import Fate
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import finish
 from mvseg.verification.numbers import EVIDENCE
 from mvseg.verification.unexplained import find_missing, share_unexplained
