@@ -18,8 +18,7 @@ from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Rejection, find_rejected, median_iou
-from mvseg.traits.from_above import look_from_above
-from mvseg.traits.leaf import UP_UNKNOWN, Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.ontology import LEAF_TRAITS
 from mvseg.traits.plant import measure_whole
 from mvseg.traits.up import level_frame
@@ -110,7 +109,6 @@ def measure_plant(
         shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
     )
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
-    cells = {} if frame is None else look_from_above(blades, frame)
     ground = 0.0  # heights start from the lowest point of all blades
     if frame is not None and blades:
         ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
@@ -121,14 +119,13 @@ def measure_plant(
         if instance in sure_views:
             numbers["sure_views"] = Measurement(float(sure_views[instance]), float("nan"), "matching")
         if instance in blades:
-            lit = UP_UNKNOWN if frame is None else Measurement(cells[instance].lit_share, float("nan"), "surface")
-            numbers |= measure_leaf(blades[instance], frame, ground=ground) | {"lit_share": lit} | appearance[instance]
+            numbers |= measure_leaf(blades[instance], frame, ground=ground) | appearance[instance]
         if instance in voxels and instance not in rejected:
             numbers |= measure_voxels(voxels[instance])
         fitted = None if surfaces is None else surfaces.get(instance, LeafSurface.none(NO_VIEWS, "has no masks"))
         rejection = rejected.get(instance)
         leaves.append(describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejection))
-    whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
+    whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected))
     return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up)
 
 

@@ -51,7 +51,6 @@ SURFACE_TRAITS = (
 )
 SEEN_TRAITS = (
     _counted("visible_share", "share of the surface's projections that the leaf's own masks cover"),
-    _counted("lit_share", "share of the area that no leaf hides from a viewer above"),
     Definition("mean_red", "1", "mean red of the surely seen pixels, 0 to 1"),
     Definition("mean_green", "1", "mean green of the surely seen pixels, 0 to 1"),
     Definition("mean_blue", "1", "mean blue of the surely seen pixels, 0 to 1"),
@@ -79,12 +78,6 @@ PLANT_TRAITS = (
     Definition("total_leaf_area", "area", "of the leaves that have a surface; the method says how many have none"),
     Definition("height", "length", "from the lowest to the highest point of the leaves", "TO:0000207"),
     Definition("convex_hull_volume", "volume", "of the convex hull of the leaves"),
-    Definition("projected_area", "area", "what the leaves cover, seen from above"),
-    Definition("light_interception", "1", "projected_area / total_leaf_area: 1 = flat and side by side"),
-    *(
-        Definition(f"leaf_area_decile_{decile}", "area", f"{decile} in 10 leaves have a smaller area")
-        for decile in range(1, 10)
-    ),
 )
 DEFINITIONS = {definition.name: definition for definition in (*LEAF_TRAITS, *PLANT_TRAITS)}
 POWERS = {"length": "", "area": "^2", "volume": "^3"}

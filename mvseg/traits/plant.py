@@ -1,7 +1,7 @@
 """Traits of a whole plant, from the surfaces of its leaves.
 
-Standard deviations take the errors of different leaves as independent. Those of hull and projected area take as given
-which points and cells are the outermost.
+Standard deviations take the errors of different leaves as independent. That of the hull takes as given which points are
+the outermost.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
-from mvseg.traits.from_above import Cells
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, missing
 from mvseg.traits.ontology import PLANT_TRAITS
 
@@ -25,15 +24,13 @@ Floats = NDArray[np.float64]
 
 NO_LEAVES = missing("not measured: no leaf has a surface")
 FLAT = missing("not measured: the leaves span no volume")
-NEED_UP = ("height", "projected_area", "light_interception")
 FROM_SURFACES = [trait.name for trait in PLANT_TRAITS[1:]]
-DECILES = FROM_SURFACES[-9:]
 
 
 def measure_whole(
-    surfaces: Mapping[int, LeafSurface], cells: Mapping[int, Cells], frame: Floats | None, *, num_leaves: int
+    surfaces: Mapping[int, LeafSurface], frame: Floats | None, *, num_leaves: int
 ) -> dict[str, Measurement]:
-    """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id, and their cells (`look_from_above`).
+    """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id.
 
     `frame` (3, 3) has the rows east, north, up, None where up is not known; `num_leaves` counts those without a
     surface, too.
@@ -41,30 +38,26 @@ def measure_whole(
     numbers = {"number_of_leaves": Measurement(float(num_leaves), float("nan"), "matching")}
     if not surfaces:
         return numbers | dict.fromkeys(FROM_SURFACES, NO_LEAVES)
-    areas = np.array([surface.area for surface in surfaces.values()])
-    is_lit = None if frame is None else np.stack([cells[instance].is_lit for instance in surfaces])
-    measure = partial(measure_together, up=None if frame is None else frame[2], is_lit=is_lit)
+    measure = partial(measure_together, up=None if frame is None else frame[2])
     coefficients = torch.stack([surface.coefficients for surface in surfaces.values()])
     slopes = torch.autograd.functional.jacobian(measure, coefficients).flatten(2)  # (T, N, 78)
     covariance = torch.stack([surface.covariance for surface in surfaces.values()])
     sds = torch.einsum("tni,nij,tnj->nt", slopes, covariance, slopes).clamp(min=0).sqrt().numpy()
-    names = ["total_leaf_area", "convex_hull_volume", *(NEED_UP if frame is not None else ())]
+    names = ["total_leaf_area", "convex_hull_volume", *(("height",) if frame is not None else ())]
     values = dict(zip(names, measure(coefficients).tolist(), strict=True))
-    if frame is not None:
-        values["light_interception"] = min(values["light_interception"], 1.0)
     method = "surface" if len(surfaces) == num_leaves else f"surface ({len(surfaces)} of {num_leaves} leaves)"
     for (name, value), sd in zip(values.items(), np.linalg.norm(sds, axis=0).tolist(), strict=True):
         numbers[name] = Measurement(value, sd, method)
     if not values["convex_hull_volume"] > 0:
         numbers["convex_hull_volume"] = FLAT
     if frame is None:
-        numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
-    return numbers | area_deciles(areas, sds[:, 0], method=method)
+        numbers["height"] = UP_UNKNOWN
+    return numbers
 
 
-def measure_together(coefficients: Tensor, up: Floats | None, is_lit: NDArray[np.bool_] | None) -> Tensor:
-    """(2,) area and volume of the hull of leaves whose patches have the coefficients (N, 26, 3); (5,) with `NEED_UP`
-    where up is known, from the cells (N, rows, columns) that are lit."""
+def measure_together(coefficients: Tensor, up: Floats | None) -> Tensor:
+    """(2,) area and volume of the hull of leaves whose patches have the coefficients (N, 26, 3); (3,) with the height
+    where up is known."""
     basis = torch.from_numpy(patch_grid(*MESH_SHAPE).basis)
     points = (basis @ coefficients).unflatten(1, MESH_SHAPE)
     diagonal = points[:, 1:, 1:] - points[:, :-1, :-1]
@@ -73,23 +66,9 @@ def measure_together(coefficients: Tensor, up: Floats | None, is_lit: NDArray[np
     area = (torch.linalg.vector_norm(lower, dim=-1) + torch.linalg.vector_norm(upper, dim=-1)).sum() / 2
     sizes = [area, hull_volume(points.reshape(-1, 3))]
     if up is not None:
-        vertical = torch.from_numpy(up)
-        heights = points @ vertical
-        shown = ((lower + upper) @ vertical).abs()[torch.as_tensor(is_lit)].sum() / 2
-        sizes += [heights.max() - heights.min(), shown, shown / area]
+        heights = points @ torch.from_numpy(up)
+        sizes.append(heights.max() - heights.min())
     return torch.stack(sizes)
-
-
-def area_deciles(areas: Floats, sds: Floats, *, method: str) -> dict[str, Measurement]:
-    """The nine deciles of the areas (N,) of N >= 1 leaves, interpolated linearly between them."""
-    order = np.argsort(areas, kind="stable")
-    numbers = {}
-    for name, share in zip(DECILES, np.arange(1, 10) / 10, strict=True):
-        place = share * (len(areas) - 1)
-        weights = np.clip(1 - np.abs(np.arange(len(areas)) - place), 0, None)
-        value, sd = weights @ areas[order], np.linalg.norm(weights * sds[order])
-        numbers[name] = Measurement(float(value), float(sd), method)
-    return numbers
 
 
 def hull_volume(points: Tensor) -> Tensor:

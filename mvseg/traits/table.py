@@ -87,7 +87,8 @@ def read_traits(
         if isinstance(error, InputError):
             raise
         raise InputError(f"{long}: is no table of traits that mvseg wrote ({error})") from None
-    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=numbers[0], up=up)
+    whole = {name: number for name, number in numbers[0].items() if name in DEFINITIONS}  # others are of older versions
+    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up)
 
 
 def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement]) -> LeafTraits:

@@ -165,8 +165,7 @@ def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
 def test_unknown_up() -> None:
     matching, surfaces = make_inputs([1, 2, 3, 4])
     traits = measure_plant(replace(SCENE, up=None), matching, surfaces=surfaces, voxels={})
-    for number in (traits.leaves[0].numbers["lit_share"], traits.leaves[0].numbers["inclination"],
-                   traits.whole["height"], traits.whole["projected_area"]):  # fmt: skip
+    for number in (traits.leaves[0].numbers["inclination"], traits.whole["height"]):
         assert not number.exists
         assert "up is not known" in number.method
     assert traits.leaves[0].numbers["area"].exists

@@ -13,7 +13,7 @@ from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, PLANT_TRAITS, VOXEL_TRAITS
-from mvseg.traits.table import COLUMNS, escape_text, format_number, write_long, write_wide
+from mvseg.traits.table import COLUMNS, escape_text, format_number, read_traits, write_long, write_wide
 
 NAN = float("nan")
 
@@ -150,3 +150,15 @@ def test_r_reads_both(tmp_path: Path) -> None:
     stopifnot(nrow(both) == 2, identical(both$iou, both$value), sum(is.na(long$leaf)) > 0)
     """
     subprocess.run(["Rscript", "-"], input=code, cwd=tmp_path, text=True, check=True)
+
+
+def test_traits_of_older_versions_are_passed_over(tmp_path: Path) -> None:
+    long, wide, traits = tmp_path / "traits.csv", tmp_path / "traits_wide.csv", traits_of()
+    write_long(long, traits)
+    write_wide(wide, traits)
+    with long.open("a") as file:
+        file.write("basil,,leaf_area_decile_1,1251.23,36.093,mm^2,surface,,UO:0000082\n")
+        file.write("basil,1,lit_share,1,,1,surface,,UO:0000186\n")
+    found = read_traits(long, wide, plant="basil", unit="mm", up=None)
+    assert found.whole.keys() == traits.whole.keys()
+    assert found.leaves[0].numbers.keys() == traits.leaves[0].numbers.keys()

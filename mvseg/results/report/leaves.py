@@ -68,16 +68,15 @@ def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Defini
 
 def describe_traits(traits: Traits | None) -> dict[str, Any]:
     """The traits of leaves that at least one leaf has, in the order of the table: what they mean, in which unit, and
-    whether the table has a column for them; those of the plant, but the deciles of its leaves' areas; and its numbers.
+    whether the table has a column for them; those of the plant; and its numbers.
     """
     if traits is None:
         return {"traits": [], "plantTraits": [], "whole": {}}
     order = (*SURFACE_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS, *SEEN_TRAITS)
     shown = [trait for trait in order if any(leaf.numbers[trait.name].exists for leaf in traits.leaves)]
-    of_plant = [trait for trait in PLANT_TRAITS if "decile" not in trait.name]
     return {
         "traits": [_describe_trait(trait, traits.unit) | {"isColumn": trait.name not in NO_COLUMNS} for trait in shown],
-        "plantTraits": [_describe_trait(trait, traits.unit) for trait in of_plant],
+        "plantTraits": [_describe_trait(trait, traits.unit) for trait in PLANT_TRAITS],
         "whole": describe_numbers(traits.whole, PLANT_TRAITS),
     }
 
