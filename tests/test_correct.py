@@ -40,6 +40,7 @@ from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.runs.recorded_run import GONE, read_recorded
+from mvseg.runs.request import RunRequest
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
@@ -68,7 +69,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A result of three balls in four views, ids only."""
     place = tmp_path_factory.mktemp("correct")
     scene = write_scene(place / "balls")
-    run_one_scene(scene, scene / "masks", place / "result", config=RunConfig(reconstruct=None))
+    run_one_scene(RunRequest(scene, scene / "masks", place / "result", RunConfig(reconstruct=None)))
     return place / "result"
 
 
@@ -454,7 +455,7 @@ def test_saved_corrections_that_are_broken_are_not_written_over(folder: Path) ->
 
 def test_photos_that_are_gone(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "balls")
-    run_one_scene(scene, scene / "masks", tmp_path / "out", config=RunConfig(reconstruct=None))
+    run_one_scene(RunRequest(scene, scene / "masks", tmp_path / "out", RunConfig(reconstruct=None)))
     for photo in (scene / "images").iterdir():
         photo.unlink()
     with pytest.raises(InputError, match="the photos of this result are gone"):
@@ -503,7 +504,7 @@ def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
 def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
     config = RunConfig(reconstruct=None, scale=0.1, unit="cm", split_merged=True)
-    run_one_scene(scene, scene / "masks", out, config=config)
+    run_one_scene(RunRequest(scene, scene / "masks", out, config))
     before = json.loads((out / "run.json").read_text())["config"]
     with serve(out) as server:
         view, at = middle(server.corrector.opened, 0)
@@ -649,7 +650,7 @@ def test_inputs_that_changed_or_moved_since(
 ) -> None:
     scene, elsewhere = write_scene(tmp_path / "here" / "balls"), tmp_path / "there"
     monkeypatch.chdir(tmp_path / "here")
-    run_one_scene(Path("balls"), Path("masks"), Path("out"), config=RunConfig(reconstruct=None))
+    run_one_scene(RunRequest(Path("balls"), Path("masks"), Path("out"), RunConfig(reconstruct=None)))
     monkeypatch.chdir(tmp_path)
     run = OpenResult(tmp_path / "here" / "out").run
     assert (run.scene, run.masks, run.changes) == (scene, scene / "masks", ())
@@ -673,7 +674,7 @@ def test_inputs_that_changed_or_moved_since(
 def test_a_strangers_result_makes_nobody_read_other_files(tmp_path: Path) -> None:
     """A device has no end, and a pipe that nobody writes to never answers."""
     scene, out = write_scene(tmp_path / "balls"), tmp_path / "out"
-    run_one_scene(scene, Path("masks"), out, config=RunConfig(reconstruct=None))
+    run_one_scene(RunRequest(scene, Path("masks"), out, RunConfig(reconstruct=None)))
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "private.txt").write_text("mine")
     run = json.loads((out / "run.json").read_text())

@@ -11,6 +11,7 @@ import pytest
 
 from mvseg.config import RunConfig
 from mvseg.runs.one_scene import run_one_scene
+from mvseg.runs.request import RunRequest
 from mvseg.server.local_server import CorrectionServer
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
@@ -31,7 +32,7 @@ def browser() -> Iterator[sync_api.Browser]:
 def folder(tmp_path: Path) -> Path:
     """A result of three balls in four views, ids only."""
     scene = write_scene(tmp_path / "balls")
-    run_one_scene(scene, scene / "masks", tmp_path / "result", config=RunConfig(reconstruct=None))
+    run_one_scene(RunRequest(scene, scene / "masks", tmp_path / "result", RunConfig(reconstruct=None)))
     return tmp_path / "result"
 
 

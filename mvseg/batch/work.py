@@ -21,7 +21,8 @@ from mvseg.errors import InputError, collect_warnings, say_fault
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, Output, check_out
 from mvseg.results.run_record import load_run
-from mvseg.runs.one_scene import find_masks, save_scene, solve_scene
+from mvseg.runs.one_scene import save_scene, solve_scene
+from mvseg.runs.request import RunRequest
 from mvseg.system.atomic import lock_folder, sweep_abandoned
 from mvseg.system.file_hash import hash_files
 
@@ -49,16 +50,15 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     with _one_at_a_time, lock_folder(folder, wait=True):
         earlier = read_status(folder)
         try:
-            masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
             config = _with_teacher(config, scene, out)
-            edits = scene.corrections and find_masks(scene.folder, scene.corrections, what="corrections")
+            request = RunRequest(scene.folder, scene.masks, place, config, corrections=scene.corrections)
+            request = request.with_found(scene.beside)
             with collect_warnings():  # the run itself gives them
-                key = scene_key(load_scene(scene.folder), masks, config, corrections=edits)
+                key = scene_key(load_scene(scene.folder), request.masks, config, corrections=request.corrections)
             if earlier is not None and earlier.key == key and _is_done(earlier, place):
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
-            cache = folder / "detections"
-            status = _finish(scene, masks, place, config=config, corrections=edits, cache=cache)
+            status = _finish(request, cache=folder / "detections")
         except Exception as error:  # whatever it is, the other scenes continue
             status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
@@ -83,23 +83,21 @@ def _is_done(status: Status, result: Path) -> bool:
     return all((result / name).is_file() for name in load_run(result).files)
 
 
-def _finish(
-    scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, corrections: Path | None, cache: Path
-) -> Status:
-    sweep_abandoned(out)
+def _finish(request: RunRequest, *, cache: Path) -> Status:
+    sweep_abandoned(request.out)
     # the name in the batch says whose the result is: scenes may have moved
-    output = Output("result", reads=tuple(path for path in (scene.folder, masks, corrections) if path is not None))
-    check_out(out, output)
-    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, cache=cache)
-    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, output=output)
+    output = Output("result", reads=(request.scene, *request.inputs))
+    check_out(request.out, output)
+    solved = solve_scene(request, cache=cache)
+    save_scene(solved, request, output)
     return Status(
         state="done",
-        scene=str(scene.folder),
-        result=hash_files(out / RUN_FILE),
-        instances=result.matching.num_instances,
-        masks=len(result.regions),
-        views=len(result.scene.views),
-        warnings=messages,
+        scene=str(request.scene),
+        result=hash_files(request.out / RUN_FILE),
+        instances=solved.result.matching.num_instances,
+        masks=len(solved.result.regions),
+        views=len(solved.result.scene.views),
+        warnings=solved.messages,
     )
 
 

@@ -47,7 +47,7 @@ def run(args: Namespace) -> int:
     from mvseg.checks.check_scene import check_scene
     from mvseg.formats.scene_folder import load_masks, load_scene
     from mvseg.results.earlier import check_file
-    from mvseg.runs.one_scene import find_masks
+    from mvseg.runs.request import find_given
 
     if args.out is not None:
         check_file(args.out / CHECK_FILE, b'"findings"')
@@ -61,7 +61,7 @@ def run(args: Namespace) -> int:
     if args.masks is not None:
         try:
             with _findings("masks", found):
-                masks = find_masks(args.scene, args.masks)
+                masks = find_given(args.scene, args.masks)
                 regions = load_masks(scene, masks, crowd=args.coco_crowd, categories=wanted)
         except InputError as error:  # the findings about cameras and photos may explain it
             unread = error

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -11,6 +13,9 @@ from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
 from mvseg.system.say import say
+
+if TYPE_CHECKING:
+    from mvseg.runs.request import RunRequest
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -29,34 +34,34 @@ def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
+    from mvseg.runs.request import RunRequest
     from mvseg.system.worker_pool import default_workers
 
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     if args.again is not None:
-        _run_again(args, num_workers)
+        run_one_scene(_request_again(args), num_workers=num_workers)
         return 0
     if args.detector is not None:
         raise InputError("--detector is of --again; the weights of a new run are --detect.weights")
     if args.scene is None:
         say("mvseg: no SCENE given: this is the plant that ships with mvseg", to_stderr=True)
     scene = args.scene or demo_scene()
-    out = args.out or DEFAULT_OUT / scene_name(scene)
-    run_one_scene(
+    request = RunRequest(
         scene,
         args.masks,
-        out,
-        config=build_run(args),
+        args.out or DEFAULT_OUT / scene_name(scene),
+        build_run(args),
         corrections=args.corrections,
         force_corrections=args.force_corrections,
-        num_workers=num_workers,
         overwrite=args.overwrite,
     )
+    run_one_scene(request, num_workers=num_workers)
     return 0
 
 
-def _run_again(args: Namespace, num_workers: int) -> None:
+def _request_again(args: Namespace) -> RunRequest:
     from mvseg.results.read import find_result
-    from mvseg.runs.one_scene import run_again
+    from mvseg.runs.request import repeat_run
 
     learn = build_run(args).learn
     if args.scene is not None or args.masks is not None or build_run(args) != RunConfig(learn=learn):
@@ -65,13 +70,11 @@ def _run_again(args: Namespace, num_workers: int) -> None:
             "options than --learn, --detector, --corrections, --force_corrections, --out, --overwrite, --num_workers "
             "and --quiet"
         )
-    run_again(
+    request = repeat_run(
         find_result(args.again),
         out=args.out,
         learn=None if learn == "auto" else learn,
         detector=args.detector,
         corrections=args.corrections,
-        force_corrections=args.force_corrections,
-        num_workers=num_workers,
-        overwrite=args.overwrite,
     )
+    return replace(request, force_corrections=args.force_corrections, overwrite=args.overwrite)

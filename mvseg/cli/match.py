@@ -24,6 +24,7 @@ def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
+    from mvseg.runs.request import RunRequest
 
     names = [scene_name(scene) for scene in args.scenes]
     for name in names:
@@ -35,16 +36,17 @@ def run(args: Namespace) -> int:
     plain = {name: args[name] for name in ("split_merged", "report", "coco_crowd", "categories")}
     config = RunConfig(match=build_options(MatchConfig, args.match, "match."), reconstruct=None, **plain)
     for scene, name in zip(args.scenes, names, strict=True):
+        request = RunRequest(
+            scene,
+            args.masks,
+            out / name,
+            config,
+            corrections=args.corrections,
+            force_corrections=args.force_corrections,
+            overwrite=args.overwrite,
+        )
         try:
-            run_one_scene(
-                scene,
-                args.masks,
-                out / name,
-                config=config,
-                corrections=args.corrections,
-                force_corrections=args.force_corrections,
-                overwrite=args.overwrite,
-            )
+            run_one_scene(request)
         except InputError as error:  # the other scenes still get their results
             code = complain(error)
     return code

@@ -80,8 +80,8 @@ class Learned:
         weights: content of the file of the weights that found the leaves, if they were learned here; None: they were
             not.
         rounds: that they took.
-        expected_right: E, the number of masks that are expected to be right, before and after each round that was
-            tried; () where nothing was to be learned.
+        expected_right: E, the number of masks that are expected to be right, before learning and after each round that
+            was tried; () where masks were given.
     """
 
     weights: bytes | None = None

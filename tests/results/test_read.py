@@ -181,12 +181,11 @@ def test_masks_of_large_photos_load_in_little_memory(balls: Result, tmp_path: Pa
 
 def test_photos_that_moved_with_the_result_are_found(plant: Path, tmp_path: Path) -> None:
     from mvseg.runs.one_scene import run_one_scene
+    from mvseg.runs.request import RunRequest
 
     shutil.copytree(plant, tmp_path / "before" / "plant")
     before = tmp_path / "before"
-    run_one_scene(
-        before / "plant", before / "plant" / "masks", before / "out", config=RunConfig(reconstruct=None)
-    )
+    run_one_scene(RunRequest(before / "plant", before / "plant" / "masks", before / "out", RunConfig(reconstruct=None)))
     before.rename(tmp_path / "after")
     views = load_result(tmp_path / "after" / "out").scene.views
     assert [view.path.parent for view in views] == [tmp_path / "after" / "plant" / "images"] * 4

@@ -1,0 +1,107 @@
+"""What is asked of a run: the command line, a batch and `--again` make one request each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from mvseg.config import RunConfig
+from mvseg.errors import InputError
+from mvseg.formats.find_views import list_some
+from mvseg.results.read import load_learned
+from mvseg.results.result import NOTHING_LEARNED, Learned
+from mvseg.runs.recorded_run import read_recorded
+from mvseg.system.say import say
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """One scene, from its folder to its result folder.
+
+    Attributes:
+        scene: folder of the scene.
+        masks: file or folder; None: a detector finds them.
+        out: folder of the result.
+        config: the options of all stages.
+        corrections: file of a person's edits; None without any.
+        force_corrections: apply them even if they were made for other photos.
+        overwrite: `out` may hold another scene's result, what another command wrote, or what a run found in its photos.
+        learned: weights that have learned this scene before are used, and not learned again.
+    """
+
+    scene: Path
+    masks: Path | None
+    out: Path
+    config: RunConfig
+    corrections: Path | None = None
+    force_corrections: bool = False
+    overwrite: bool = False
+    learned: Learned = NOTHING_LEARNED
+
+    @property
+    def inputs(self) -> tuple[Path, ...]:
+        """The masks and corrections that were given."""
+        return tuple(path for path in (self.masks, self.corrections) if path is not None)
+
+    def with_found(self, beside: Path = Path()) -> RunRequest:
+        """The same with masks and corrections where they lie, see `find_given`."""
+        masks = None if self.masks is None else find_given(self.scene, self.masks, beside)
+        edits = None if self.corrections is None else find_given(self.scene, self.corrections, what="corrections")
+        return replace(self, masks=masks, corrections=edits)
+
+
+def repeat_run(
+    folder: Path,
+    *,
+    out: Path | None = None,
+    learn: int | Literal["auto", "off"] | None = None,
+    detector: Path | None = None,
+    corrections: Path | None = None,
+) -> RunRequest:
+    """The request that made a result, once more, with its options; stderr says what has changed since.
+
+    Args:
+        folder: the result.
+        out: where the new one goes; None: in its place.
+        learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: what the run has learned
+            before is used.
+        detector: file of weights that have learned this scene; None: that of the result, if it has one.
+        corrections: file of a person's edits; None: that of the run, if it had one.
+
+    Raises:
+        InputError: see `read_recorded`.
+    """
+    run = read_recorded(folder)
+    for change in run.changes:
+        say(f"mvseg: {change}", to_stderr=True)
+    learned = load_learned(folder, run.said)
+    if detector is not None:
+        learned = replace(learned, weights=detector.read_bytes(), rounds=1)
+    edits = corrections or run.corrections
+    return RunRequest(
+        run.scene,
+        None if run.masks is None else run.masks.resolve(),
+        folder if out is None else out,
+        run.config if learn is None else replace(run.config, learn=learn),
+        corrections=None if edits is None else Path(edits).resolve(),
+        learned=learned if learn is None else NOTHING_LEARNED,
+    )
+
+
+def find_given(scene: Path, given: Path, beside: Path = Path(), *, what: str = "masks") -> Path:
+    """Where masks, or `what` else is given with a scene, lie.
+
+    A relative path may start at the scene folder or at `beside`, as long as only one of the two exists.
+
+    Raises:
+        InputError: both exist, or neither.
+    """
+    inside, outside = scene / given, beside / given
+    if inside.exists() and outside.exists() and not inside.samefile(outside):
+        raise InputError(f"both {inside} and {outside.resolve()} exist, expected --{what} with the full path of one")
+    if scene.is_dir() and not inside.exists() and not outside.exists() and not given.is_absolute():
+        found = list_some(sorted(path.name for path in scene.iterdir()))
+        places = f"in {scene}, which holds {found}, nor in {beside.resolve()}"
+        raise InputError(f"{given}: no such {what} {places}; --{what} says where they are")
+    return inside if inside.exists() else outside
