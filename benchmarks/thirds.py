@@ -1,7 +1,7 @@
 """What does a third more or less of a room's numbers change? `python benchmarks/thirds.py --cache DIR [--room NAME]`
 
-Numbers are those of a room's `numbers.py`; one at a time is divided and
-multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants.
+Numbers are those of a room's `numbers.py`; one at a time is divided and multiplied by 1.33, whole numbers change by 1
+at least, and of several each by itself. The scenes are development plants.
 
 Of matching, with degraded masks: a line says of each scene how many ids of "nview" and of "one-per-view" change, by how
 much their pair F1, and how far match scores move. Of verification: how many masks change their instance or their
@@ -11,7 +11,9 @@ folders of `--scenes`; and where up to `MOST_DRAWN` of these leaves were missed,
 or in three (half of their other masks are still there, matched to nothing). Of reconstruction, with the masks of
 `--masks`: of all leaves together, how far area and its standard deviation move (median and largest change in percent),
 of how many it changes whether they are credible, doubted or oriented, and how far the volume of voxels moves; ids are
-true but for one scene, where they are those of "nview".
+true but for one scene, where they are those of "nview". Of tracking, for each series: how many links come or go, by how
+much short and long change, and how far the probabilities of links move; the series are simulated plants, two plants in
+one pot, and those of `--series`, TABLE RESULTS as `benchmarks/tracking.py results` takes them.
 """
 
 from __future__ import annotations
@@ -36,12 +38,14 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import mvseg.matching.numbers
 import mvseg.reconstruction.numbers
+import mvseg.tracking.numbers
 import mvseg.verification.numbers
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
 from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
+from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
@@ -66,7 +70,10 @@ from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
 from mvseg.simulation.growth import grow_plant
+from mvseg.simulation.series import draw_specs
 from mvseg.system.running import running
+from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.track import track_leaves
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
@@ -81,9 +88,7 @@ MOST_DRAWN = 4  # leaves of a scene
 FOUND = ((10, 16, 0), (10, 32, 1))  # where a detector finds leaves, beside the plant that ships
 
 
-def scaled(value: Any, factor: float) -> Any:
-    if isinstance(value, tuple):
-        return tuple(scaled(each, factor) for each in value)
+def scaled(value: float, factor: float) -> float:
     if isinstance(value, int):
         return round(value * factor) if round(value * factor) != value else value + (1 if factor > 1 else -1)
     return value * factor
@@ -92,6 +97,16 @@ def scaled(value: Any, factor: float) -> Any:
 def is_number(value: Any) -> bool:
     """Whether it is a number, or several."""
     return all(map(is_number, value)) if isinstance(value, tuple) else isinstance(value, int | float)
+
+
+def list_changes(value: Any) -> Iterator[tuple[str, Any]]:
+    """(what is done, the value after it)."""
+    for factor in (1 / FACTOR, FACTOR):
+        if isinstance(value, tuple):
+            for place, each in enumerate(value):
+                yield f"[{place}] x {factor:.2f}", (*value[:place], scaled(each, factor), *value[place + 1 :])
+        else:
+            yield f" x {factor:.2f}", scaled(value, factor)
 
 
 def list_numbers(numbers: ModuleType) -> Iterator[tuple[str, Any, str]]:
@@ -156,13 +171,13 @@ def try_numbers(numbers: ModuleType, only: list[str] | None, compare: Callable[[
     """Print what each number of a `numbers.py` changes, by what `compare` says of its group while it is another."""
     for key, group, name in list_numbers(numbers):
         is_tried = is_number(getattr(group, name)) and (only is None or name in only)
-        for factor in (1 / FACTOR, FACTOR) if is_tried else ():
+        for what, value in list_changes(getattr(group, name)) if is_tried else ():
             try:
-                with changed(group, **{name: scaled(getattr(group, name), factor)}):
+                with changed(group, **{name: value}):
                     said = compare(group)
             except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                 said = f"cannot be: {error}"
-            print(f"{key}.{name} x {factor:.2f}: {said}", flush=True)
+            print(f"{key}.{name}{what}: {said}", flush=True)
 
 
 def thirds_of_matching(args: argparse.Namespace) -> None:
@@ -361,15 +376,66 @@ def compare_leaves(before: np.ndarray, after: np.ndarray) -> str:
     return ", ".join([*parts, f"volume {np.nanmax(volume):.1f}"])
 
 
+# --- tracking
+
+
+Series = dict[str, tuple[list[PlantOnDate], Labels]]
+Links = dict[tuple[str, int, int, int], float]  # {(plant, date, leaf, the leaf before): probability}
+
+
+def simulated_series() -> dict[str, Series]:
+    """Five plants of seed 5, eight of seed 20, and four times two plants in one pot."""
+    specs = draw_specs(4, seed=41)
+    pairs = zip(specs, [*specs[1:], *specs[:1]], strict=True)
+    return {
+        "seed 5": {spec.name: see_series(spec) for spec in draw_specs(5, seed=5)},
+        "seed 20": {spec.name: see_series(spec) for spec in draw_specs(8, seed=20)},
+        "two": {one.name: see_two_plants(one, other, turn=60.0) for one, other in pairs},
+    }
+
+
+def track_series(series: Series) -> tuple[Links, np.ndarray]:
+    """The links of all plants, and the means (2,) of short and long."""
+    links: Links = {}
+    measures = []
+    for plant, (dates, truth) in series.items():
+        tracks, before = track_leaves(dates), dict[int, int]()
+        found = measure(truth, labels_of(tracks))
+        measures.append((found["short"], found["long"]))
+        for row in tracks.rows:
+            if row.leaf is not None:
+                links[plant, row.date, row.leaf, before.get(row.track, 0)] = row.probability
+                before[row.track] = row.leaf
+    return links, np.mean(measures, axis=0)
+
+
+def compare_links(before: tuple[Links, np.ndarray], after: tuple[Links, np.ndarray]) -> str:
+    moved = before[0].keys() ^ after[0].keys()
+    steps = [abs(after[0][link] - chance) for link, chance in before[0].items() if link in after[0]]
+    short, long = after[1] - before[1]
+    return f"{len(moved):3} links {short:+.3f} {long:+.3f} p {np.nanmax([0.0, *steps]):.2f}"
+
+
+def thirds_of_tracking(args: argparse.Namespace) -> None:
+    every = read_places(args.series) | simulated_series()
+    before = {name: track_series(series) for name, series in every.items()}
+
+    def compare(_: Any) -> str:
+        return " | ".join(f"{key}: {compare_links(before[key], track_series(own))}" for key, own in every.items())
+
+    try_numbers(mvseg.tracking.numbers, args.numbers, compare)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cache", type=Path, required=True, help="folder for rendered scenes and detections")
+    parser.add_argument("--cache", type=Path, default=Path("results/thirds"), help="folder for rendered scenes")
     parser.add_argument("--room", choices=ROOMS, default="matching")
     parser.add_argument("--numbers", nargs="+", help="only these")
     parser.add_argument("--masks", choices=KINDS, default="degraded", help="that leaves are reconstructed from")
     parser.add_argument("--trials", choices=TRIALS, nargs="+", default=list(TRIALS), help="of verification")
     parser.add_argument("--given", type=Path, nargs="*", default=[], help="plants to check, with masks/ and truth/")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], help="more to verify, with photos and truth/")
+    parser.add_argument("--series", type=Path, nargs="*", default=[], help="TABLE RESULTS of real series to track")
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
@@ -381,6 +447,7 @@ ROOMS = {
     "matching": thirds_of_matching,
     "verification": thirds_of_verification,
     "reconstruction": thirds_of_reconstruction,
+    "tracking": thirds_of_tracking,
 }
 
 if __name__ == "__main__":

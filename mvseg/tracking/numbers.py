@@ -1,6 +1,6 @@
 """The numbers of tracking: definitions, technical limits, and what was fitted to simulated and real series.
 
-`python -m benchmarks.thirds_of_tracking` prints what a third less or more of each changes; the table is in
+`python benchmarks/thirds.py --room tracking` prints what a third less or more of each changes; the table is in
 docs/notes/tracking.md. Scales and weights that were fitted together stand in `fitted_costs.py`, `align.py` and
 `associate.py`.
 """
