@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from mvseg.system.say import plain
@@ -131,6 +132,9 @@ def running(
 def timed(stage: str) -> Iterator[None]:
     """A stage of a run: `Running.seconds` has its wall time, the sum if it comes more than once.
 
+    NumPy and SciPy use one thread inside: for matrices of 78 x 78, waking the others takes longer than the product.
+    (torch's threads are left alone: networks need them.)
+
     Raises:
         Cancelled: the run is not wanted any more.
     """
@@ -139,7 +143,8 @@ def timed(stage: str) -> Iterator[None]:
         raise Cancelled
     now.reach(stage)
     begun = time.perf_counter()
-    yield
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
 
 

@@ -8,7 +8,9 @@ import sys
 import threading
 from contextvars import copy_context
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from mvseg.errors import InputError
 from mvseg.system.running import Running, now_running, progress_bar, running, timed
@@ -87,3 +89,23 @@ def test_steps_are_reported_also_where_there_are_none_or_they_cannot_be_counted(
         assert list(progress_bar(iter("ab"), "surfaces", 2, unit="instance")) == ["a", "b"]
         assert list(progress_bar(range(1), "views", unit="view")) == [0]
     assert said == ["surfaces: instance 1 of 2", "surfaces: instance 2 of 2", "views: view 1 of 1"]
+
+
+def blas_threads() -> set[int]:
+    """Threads of the libraries that NumPy and SciPy multiply with."""
+    np.linalg.inv(np.eye(2))  # it is loaded
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_stages_multiply_on_one_thread_and_give_back_the_others() -> None:
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = blas_threads()
+        with timed("match"):
+            assert blas_threads() == {1}
+            with timed("surfaces"):
+                assert blas_threads() == {1}
+            assert blas_threads() == {1}
+        assert blas_threads() == before
+        with pytest.raises(ZeroDivisionError), timed("match"):
+            _ = 1 / 0
+        assert blas_threads() == before
