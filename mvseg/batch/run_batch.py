@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-
-from tqdm import tqdm
 
 from mvseg._version import made_by
 from mvseg.batch.scene_list import BatchScene, list_scenes, with_teachers
@@ -22,7 +19,7 @@ from mvseg.errors import InputError
 from mvseg.results.earlier import Output, check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 from mvseg.system.running import progress_bar
-from mvseg.system.say import plain
+from mvseg.system.say import say_beside_bars
 
 SHOWN = 4  # names of running scenes beside the progress bar
 
@@ -161,12 +158,12 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
                         del running[index]
                         show()
                         if isinstance(answer, Lost) and not is_last:
-                            _say(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
+                            say_beside_bars(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
                             again.append(index)
                             continue
                         finished[index] = _give_up(scenes[index], answer, out) if isinstance(answer, Lost) else answer
                         if finished[index].status.state == "failed":
-                            _say(f"{scenes[index].name}: {finished[index].status.sentence}")
+                            say_beside_bars(f"{scenes[index].name}: {finished[index].status.sentence}")
                         bar.update()
             finally:
                 for index in running:  # killed workers did not clean up
@@ -179,16 +176,13 @@ def _replace_teachers(waiting: Mapping[int, BatchScene]) -> dict[int, BatchScene
     first: dict[str | None, str] = {}
     for scene in waiting.values():
         if first.setdefault(scene.teacher, scene.name) == scene.name:
-            _say(f"{scene.teacher}: failed, so that it teaches no other plant; {scene.name} teaches in its place")
+            failed = f"{scene.teacher}: failed, so that it teaches no other plant"
+            say_beside_bars(f"{failed}; {scene.name} teaches in its place")
     teachers = {index: first[scene.teacher] for index, scene in waiting.items()}
     return {
         index: replace(scene, teacher=None if teachers[index] == scene.name else teachers[index])
         for index, scene in waiting.items()
     }
-
-
-def _say(text: str) -> None:
-    tqdm.write(f"mvseg: {plain(text)}", file=sys.stderr)
 
 
 def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:

@@ -32,7 +32,7 @@ from mvseg.pipeline.known import Known
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
-from mvseg.system.running import say, timed
+from mvseg.system.running import report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
 from mvseg.verification.unexplained import is_familiar
@@ -76,7 +76,7 @@ def learn(
                 few = f"the views agree about {labels.num_leaves} leaves, and it takes {LEAST_LEAVES} to learn from"
                 warn(f"the detector has not learned this plant: {few}; outline some (mvseg correct), or give masks")
                 break
-            say(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
+            report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             seen = _learn_once(known, labels, cache)
             expected.append(seen.expected_right)
             if rounds is None and seen.expected_right < GROWTH * best.expected_right:

@@ -45,7 +45,7 @@ class RunRequest:
         return tuple(path for path in (self.masks, self.corrections) if path is not None)
 
     def with_found(self, beside: Path = Path()) -> RunRequest:
-        """The same with masks and corrections where they lie, see `find_given`."""
+        """The same with the places of masks and corrections, see `find_given`; only masks may lie `beside`."""
         masks = None if self.masks is None else find_given(self.scene, self.masks, beside)
         edits = None if self.corrections is None else find_given(self.scene, self.corrections, what="corrections")
         return replace(self, masks=masks, corrections=edits)

@@ -21,7 +21,7 @@ from typing import Any, ParamSpec, TypeVar
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from mvseg.system.say import plain
+from mvseg.system.say import say_beside_bars
 from mvseg.system.worker_pool import start_workers
 
 
@@ -166,12 +166,13 @@ def kept(compute: Callable[Args, Found]) -> Callable[Args, Found]:
     return find
 
 
-def say(sentence: str) -> None:
-    """A line that says what is done, beside the progress bars; nothing where the run is silent."""
+def report_step(sentence: str) -> None:
+    """Tell whoever asked for reports what is done now, or print it beside the progress bars; nothing where the run is
+    silent."""
     if (report := now_running().report) is not None:
         report(sentence)
     elif now_running().progress:
-        tqdm.write(f"mvseg: {plain(sentence)}", file=sys.stderr)
+        say_beside_bars(sentence)
 
 
 def progress_bar(

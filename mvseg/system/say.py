@@ -17,3 +17,10 @@ def plain(text: str) -> str:
 def say(text: object = "", *, to_stderr: bool = False, end: str = "\n") -> None:
     """Print on stdout, or on stderr, at once."""
     print(plain(str(text)), end=end, file=sys.stderr if to_stderr else sys.stdout, flush=True)
+
+
+def say_beside_bars(sentence: str) -> None:
+    """Print "mvseg: " and a sentence on stderr, above the progress bars, which stay where they are."""
+    from tqdm import tqdm  # whoever shows bars has it; others need not load it to say a word
+
+    tqdm.write(f"mvseg: {plain(sentence)}", file=sys.stderr)

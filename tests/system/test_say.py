@@ -30,5 +30,4 @@ def test_nothing_else_prints() -> None:
     for path in package.rglob("*.py"):
         if path.name != "say.py":
             source = path.read_text(encoding="utf-8")
-            assert not re.search(r"(?<![\w.])print\(|std(out|err)\.write", source), path
-            assert all("plain(" in call for call in re.findall(r"tqdm\.write\(.*", source)), path
+            assert not re.search(r"(?<![\w.])print\(|std(out|err)\.write|tqdm\.write", source), path
