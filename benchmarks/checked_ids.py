@@ -47,8 +47,8 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
-from mvseg.verification.checked_ids import check_ids, join_parts, move_pieces
-from mvseg.verification.evidence import Shown, see
+from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.evidence import see
 from mvseg.verification.shown_leaves import (
     GIVEN,
     GivenScores,
@@ -114,7 +114,7 @@ class Study:
     Attributes:
         given: the masks.
         before: (D,) ids of the matcher.
-        question: once pieces and halves have joined their leaves.
+        question: which leaf each mask shows.
         of_candidate: (K,) the leaf that most masks of each candidate show.
     """
 
@@ -126,10 +126,7 @@ class Study:
     @staticmethod
     def of(given: Given, matched: Masks, surfaces: dict[int, LeafSurface]) -> Study:
         nothing = np.zeros(len(matched), bool)
-        pieced = move_pieces(matched, Shown.of(given.regions, surfaces, given.cameras), is_held=nothing)
-        joined, known = join_parts(pieced, surfaces, cameras=given.cameras, is_held=nothing)
-        is_held = (pieced.instance_ids != matched.instance_ids).numpy()
-        question = ask(joined, known, cameras=given.cameras, config=MatchConfig(), is_held=is_held)
+        question = ask(matched, surfaces, cameras=given.cameras, config=MatchConfig(), is_held=nothing)
         members = ~np.isnan(question.candidates.matched)
         own = question.leaf[:, None] == np.arange(members.shape[1])
         members = np.where(question.is_known, own, members)  # not those that joined later

@@ -47,6 +47,7 @@ from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.config import RunConfig
+from mvseg.corrections.as_seen import name_each
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -63,7 +64,6 @@ from mvseg.matching.split import split_merged
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps

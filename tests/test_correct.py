@@ -24,7 +24,8 @@ import torch
 from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
-from mvseg.corrections.file import FORMAT, Corrections, load_corrections, name_edits, parse_corrections
+from mvseg.corrections.as_seen import name_each
+from mvseg.corrections.file import FORMAT, Corrections, Reject, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError, warn
@@ -34,7 +35,7 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.run_scene import run_scene
-from mvseg.reconstruction.surface.kept_surfaces import name_each
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
@@ -225,11 +226,36 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     (folder / "corrections.json").unlink()
 
 
+def test_edits_and_undo_end_where_a_fresh_run_does_bit_for_bit(tmp_path: Path) -> None:
+    scene, config = write_scene(tmp_path / "balls"), RunConfig(reconstruct=ReconstructConfig(voxel_budget=500))
+    run_one_scene(RunRequest(scene, scene / "masks", tmp_path / "result", config))
+    opened = OpenResult(tmp_path / "result")
+    one, other = middle(opened, 1), middle(opened, 5)
+    reject, unlike = Reject(view=one[0], at=one[1]), Reject(view=other[0], at=other[1], everywhere=True)
+    for edits in ((), (reject,), (reject, unlike), (unlike,), (), (reject,)):
+        corrections = with_marks(Corrections(edits), opened.scene, mark_photos(opened.photos))
+        shown = opened.recompute(corrections, lambda: False)[0]
+        run = run_scene(scene, scene / "masks", config, corrections=corrections)
+        assert len(run.surfaces or {}) == (2 if unlike in edits else 3)
+        assert surfaces_by_masks(shown) == surfaces_by_masks(run)
+
+
+def surfaces_by_masks(result: Result) -> dict[tuple[str, ...], bytes]:
+    """{names of a leaf's masks: its surface}: the page keeps the numbers that the result has had."""
+    masks, surfaces = result.masks, result.surfaces or {}
+    return {
+        tuple(sorted(name_each(masks.regions.select(masks.instance_ids == leaf)))): b"".join(
+            each.numpy().tobytes() for each in (surface.coefficients, surface.covariance, surface.iou)
+        )
+        for leaf, surface in surfaces.items()
+    }
+
+
 def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = OpenResult(folder)
     opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"warnings": ("2 masks are cut off",)}))
 
-    def shape(known: Known) -> Result:
+    def shape(known: Known, **_: object) -> Result:
         warn("3 masks are cut off")
         warn("photo 1 is dark")
         warn("photo 2 is dark")

@@ -227,7 +227,7 @@ class TestDescribeRun:
         rig, first = plant / "cameras.json", plant / "masks" / "000.png"
         inputs = {str(path): hash_files(path) for path in (rig, plant / "masks")}
 
-        def change(known: Known) -> Result:
+        def change(known: Known, **_: object) -> Result:
             for path in (rig, first):
                 path.write_bytes(path.read_bytes() + b"\n")
             return finish(known)
@@ -249,10 +249,10 @@ class TestDescribeRun:
 def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
     plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_wanted: bool
 ) -> None:
-    fits: list[tuple[list[int], dict[int, LeafSurface]]] = []
+    fits: list[list[int]] = []
 
-    def fit(_: object, ids: torch.Tensor, *__: object, known: Any, **___: object) -> dict[int, LeafSurface]:
-        fits.append((ids.tolist(), dict(known)))
+    def fit(_: object, ids: torch.Tensor, *__: object, **___: object) -> dict[int, LeafSurface]:
+        fits.append(ids.tolist())
         return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
 
     def check(masks: Masks, *_: object, **__: object) -> Masks:
@@ -260,20 +260,18 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         ids[0] = ids[0] % 3 + 1
         return replace(masks, instance_ids=ids)
 
-    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
     config = RunConfig(reconstruct=ReconstructConfig(check_ids=is_wanted, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     save_result(result, tmp_path / "out", {}, report=False)
     counts = json.loads((tmp_path / "out" / "run.json").read_text())["counts"]
     assert len(fits) == (2 if is_wanted else 1)
-    assert fits[0][1] == {}
-    assert fits[-1][0] == result.matching.instance_ids.tolist()
+    assert fits[-1] == result.matching.instance_ids.tolist()
     assert result.num_moved == (1 if is_wanted else None)
     assert counts.get("moved") == result.num_moved
     if is_wanted:
-        assert len(fits[1][1]) == 1
-        assert sum(a != b for a, b in zip(fits[0][0], fits[1][0], strict=True)) == 1
+        assert sum(a != b for a, b in zip(*fits, strict=True)) == 1
         assert result.voxels is not None
 
 
@@ -288,10 +286,10 @@ def show_two(masks: Masks) -> Masks:
 def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_again(
     plant: Path, monkeypatch: pytest.MonkeyPatch, is_checked: bool
 ) -> None:
-    fits: list[tuple[list[int], list[int]]] = []
+    fits: list[list[int]] = []
 
-    def fit(_: object, ids: torch.Tensor, *__: object, known: Any, **___: object) -> dict[int, LeafSurface]:
-        fits.append((ids.tolist(), list(known)))
+    def fit(_: object, ids: torch.Tensor, *__: object, **___: object) -> dict[int, LeafSurface]:
+        fits.append(ids.tolist())
         return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
 
     def check(masks: Masks, *_: object, **__: object) -> Masks:
@@ -301,7 +299,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
         matching = match_masks(*args, **kwargs)
         return matching.with_masks(show_two(matching.masks))
 
-    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
     monkeypatch.setattr("mvseg.pipeline.known.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
@@ -311,8 +309,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
     assert ids[1] == ids[0] % 3 + 1
     assert len(result.regions) == len(ids)
     whole = [ids[0], *ids[2:]]
-    left = [number for number in (1, 2, 3) if number not in ids[:2]]
-    assert fits == ([(whole, []), (ids, left)] if is_checked else [(ids, [])])
+    assert fits == ([whole, ids] if is_checked else [ids])
 
 
 def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
@@ -328,7 +325,7 @@ def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
     def join(masks: Masks, *_: object, **__: object) -> Masks:
         return replace(masks, instance_ids=masks.instance_ids.where(masks.instance_ids != 1, 2))
 
-    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", join)
     known = match_given(open_scene(plant, plant / "masks", RunConfig(split_merged=True)))
     shape_leaves(replace(known, instances=Instances(starts=starts)))

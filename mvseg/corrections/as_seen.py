@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import torch
 from torch import Tensor
 
 from mvseg.corrections.corrected import Corrected
 from mvseg.masks import Masks, Origin
-from mvseg.reconstruction.surface.kept_surfaces import name_each
+from mvseg.regions import Regions
+
+
+def name_each(regions: Regions) -> list[str]:
+    """A name of each of D regions by view and pixels: regions have the same name only if they are equal."""
+    regions = regions.to("cpu")
+    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
+    pixels = (hashlib.sha256(regions.crop(row).numpy().tobytes()).hexdigest() for row in range(len(regions)))
+    return [f"{view} {box} {digest}" for (view, box), digest in zip(places, pixels, strict=True)]
 
 
 def seen_ids(masks: Masks, before: Masks) -> Tensor:

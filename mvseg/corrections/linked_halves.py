@@ -6,10 +6,12 @@ linked masks, and leave the others to either half.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mvseg.corrections.as_seen import seen_ids
@@ -19,8 +21,9 @@ from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.join_halves import are_one_leaf
 
 
 def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Corrected:
@@ -48,13 +51,43 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
         if len({int(masks.view_index[row]) for row, _ in halves}) < EDITS.least_halves:
             continue
         own = torch.where(ids == one, 1, torch.where(ids == other, 2, -1))
-        surfaces = fit_surfaces(masks.regions, own, cameras)  # not kept: what hides a leaf is not here
-        if are_one_leaf(masks.regions, own, surfaces, cameras=cameras):
+        if are_one_leaf(masks.regions, own, cameras):
             more = Links(torch.cat((links.must, torch.tensor(halves))), links.cannot)
             with suppress(InputError):
                 more.components(len(masks))
                 links, is_linked = more, is_linked | Links.of(halves).named(len(masks))
     return replace(corrected, links=links, masks=replace(masks, is_linked=is_linked))
+
+
+def are_one_leaf(regions: Regions, ids: Tensor, cameras: Cameras) -> bool:
+    """Whether the surfaces of the instances 1 and 2 of D regions, `ids` (D,) int64, touch, and one surface shows the
+    masks of both as well as their own do."""
+    parts = fit_surfaces(regions, ids, cameras)
+    if not all(each.exists for each in parts.values()):
+        return False
+    joint = fit_surfaces(regions, ids.clamp(max=1), cameras)[1]
+    return _touches(parts[1], parts[2]) and fits_as_well(joint, [parts[1], parts[2]])
+
+
+def _touches(one: LeafSurface, other: LeafSurface) -> bool:
+    points, tree = one.points().reshape(-1, 3).numpy(), cKDTree(other.points().reshape(-1, 3).numpy())
+    return float(tree.query(points)[0].min()) <= EDITS.touches * one.length
+
+
+def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
+    """Whether it is credible, its median IoU that of the worst of the parts or more, and its outline as near to those
+    of the masks.
+
+    The IoU alone would forgive a larger surface: outlines that are as uncertain take a smaller share of it.
+    """
+    worst = min(float(part.iou.median()) for part in parts)
+    farthest = max(_outline_px(part) for part in parts)
+    return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= EDITS.as_near * farthest
+
+
+def _outline_px(surface: LeafSurface) -> float:
+    """Root mean square distance between its outline and those of its masks, over the views with both."""
+    return float(surface.residual_px.square().nanmean().sqrt())
 
 
 def _in_one_photo(masks: Masks, is_one: Tensor, is_other: Tensor) -> list[tuple[int, int]]:

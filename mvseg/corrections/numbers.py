@@ -19,6 +19,8 @@ class EditNumbers:
     covered: float = 0.5  # definition: share of a mask above which an outline that covers it replaces it
     most_covered: int = 3  # masks that an outline replaces without a word: two stems before a leaf make three pieces
     least_halves: int = 2  # photos that show two instances, from which a link between them may be about both
+    touches: float = 0.02  # distance of the surfaces of two halves, as a fraction of the length of the first, at most
+    as_near: float = 1.1  # distance of the outline of one surface that fits as well as two, in theirs, at most
     fine: int = 4  # limit: bits of a pixel's fraction, along a cut
     touches_px: int = 2  # gap between two masks of one leaf in one photo, at most, where they hang together
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined

@@ -16,6 +16,7 @@ from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
@@ -125,6 +126,7 @@ def find_leaves(
     *,
     config: DetectConfig = DetectConfig(),
     splits: bool = False,
+    cache: SurfaceCache | None = None,
 ) -> Found:
     """The views choose leaves and masks from everything that one or more looks propose, see `choose_leaves`.
 
@@ -133,6 +135,7 @@ def find_leaves(
         cameras: V cameras.
         config: `verify`, `min_score` and `min_probability`.
         splits: cut masks that seem to show two leaves, before the views choose.
+        cache: of surfaces, see `fit_surfaces`.
     """
     matched, proposals, offset = [], [], 0
     for look in looks:
@@ -152,6 +155,11 @@ def find_leaves(
     if config.verify:
         with timed("choose"):
             leaves = choose_leaves(
-                first, everything, cameras=cameras, more=matched[1:], min_probability=config.min_probability
+                first,
+                everything,
+                cameras=cameras,
+                more=matched[1:],
+                min_probability=config.min_probability,
+                cache=cache,
             )
     return Found(tuple(looks), leaves, everything, tuple(matched), looks[0].sure.report)

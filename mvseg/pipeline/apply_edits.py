@@ -51,7 +51,9 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
         with timed("follow"):
             photos = opened.photos if opened.photos.exist else None
             colors = known.leaf_colors if photos is not None and known.matching.num_instances else None
-            masks, starts = follow_drawn(edited.masks, cameras=cameras, photos=photos, colors=colors)
+            masks, starts = follow_drawn(
+                edited.masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces
+            )
             edited = replace(edited, instances=Instances(starts=starts)).with_masks(masks)
     edited = edited.cut_merged()
     if not opened.is_chosen:
@@ -67,6 +69,7 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
             seen=seen_ids(masks, replace(corrected.masks, instance_ids=seen)),
             drawn=known.drawn,
             min_probability=config.detect.min_probability,
+            cache=opened.surfaces,
         )
     return edited.with_leaves(leaves)
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import io
 import zlib
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 
 from mvseg.masks import Masks
@@ -19,28 +19,29 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache
 from mvseg.regions import Regions
 from mvseg.results.result import Instances
-from mvseg.system.running import now_running
 from mvseg.verification.choose import LeftOut
 
 MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
 FIELDS = ("matching", "instances", "proposals", "matched", "left", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
-CLASSES: list[Any] = [Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality, Regions]
+CLASSES: list[Any] = [Approach, Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality, Regions]
 
 
 def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
     """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`). None where it is
     too much to be read again."""
     packed = io.BytesIO()
-    kept = now_running().kept or {}
+    opened = known.opened
     torch.save(
         {
-            "views": known.opened.names,
+            "views": opened.names,
             "known": {name: getattr(known, name) for name in FIELDS},
-            "surfaces": {name: each for name, each in kept.items() if isinstance(each, LeafSurface)},
-            "masks": {name: torch.from_numpy(each) for name, each in kept.items() if isinstance(each, np.ndarray)},
+            "approaches": opened.surfaces.approaches,
+            "surfaces": opened.surfaces.surfaces,
+            "snapped": {name: torch.from_numpy(each) for name, each in opened.snapped.items()},
             "said": list(said),
         },
         packed,
@@ -49,9 +50,10 @@ def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
 
 
 def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | None:
-    """What `pack_known` packed, on the CPU, for the scene as it was opened, and the warnings; what was fitted is kept
-    where the run keeps what it computed. There are no looks: a detector that is to learn looks again. None: it is of
-    other views, or something else."""
+    """What `pack_known` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
+
+    There are no looks: a detector that is to learn looks again. None: it is of other views, or something else.
+    """
     try:
         inflated = zlib.decompressobj().decompress(content, MOST_BYTES + 1)
         if len(inflated) > MOST_BYTES:
@@ -60,9 +62,9 @@ def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | No
             packed = torch.load(io.BytesIO(inflated), map_location="cpu", weights_only=True)
         if packed["views"] != opened.names:
             return None
-        known = Known(opened=opened, looks=(), **packed["known"])
-        if (kept := now_running().kept) is not None:
-            kept.update(packed["surfaces"] | {name: each.numpy() for name, each in packed["masks"].items()})
-        return known, packed["said"]
+        surfaces = SurfaceCache(packed["approaches"], packed["surfaces"])
+        snapped = {name: each.numpy() for name, each in packed["snapped"].items()}
+        opened = replace(opened, surfaces=surfaces, snapped=snapped)
+        return Known(opened=opened, looks=(), **packed["known"]), packed["said"]
     except Exception:  # zlib and torch raise many kinds at broken files
         return None

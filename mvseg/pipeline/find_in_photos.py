@@ -69,7 +69,7 @@ def look_once(
 
 
 def _choose(opened: Opened, look: Look, detect: DetectConfig) -> Found:
-    return find_leaves([look], opened.scene.cameras, config=detect, splits=opened.is_cut)
+    return find_leaves([look], opened.scene.cameras, config=detect, splits=opened.is_cut, cache=opened.surfaces)
 
 
 def know(opened: Opened, found: Found) -> Known:

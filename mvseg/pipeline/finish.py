@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 # scenes to match.
 
 
-def finish(known: Known) -> Result:
-    """The final masks and ids, shapes and traits; and what there is to say of them."""
-    result, config = shape_leaves(known), known.opened.config
+def finish(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
+    """The final masks and ids, shapes and traits; and what there is to say of them. For the arguments see
+    `shape_leaves`."""
+    result, config = shape_leaves(known, same_segmenter=same_segmenter), known.opened.config
     if known.disagreement:
         warn(known.disagreement)
     if (missing := _find_missing(known, result)) is not None:
@@ -45,27 +46,33 @@ def finish(known: Known) -> Result:
     return _measure(result, config, config.reconstruct)
 
 
-def shape_leaves(known: Known) -> Result:
+def shape_leaves(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
     """The final masks and ids, and their surfaces: what the page shows that a person corrects.
 
     Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted by a later one.
+
+    Args:
+        known: the masks.
+        same_segmenter: the surfaces before edits, see `fit_surfaces`; None: there are no edits.
     """
     opened, config, num_moved = known.opened, known.opened.config, None
     if opened.is_chosen:
         from mvseg.verification.snap_edges import snap_masks
 
         with timed("snap"):
-            known = known.with_masks(snap_masks(known.masks, opened.photos))
+            known = known.with_masks(snap_masks(known.masks, opened.photos, cache=opened.snapped))
     if opened.is_checked:
         from mvseg.verification.checked_ids import check_ids
 
-        fitted = _fit_surfaces(known)
+        fitted = _fit_surfaces(known, same_segmenter)
         with timed("check_ids"):
-            checked = check_ids(known.masks, fitted, cameras=known.scene.cameras, config=config.match)
+            checked = check_ids(
+                known.masks, fitted, cameras=known.scene.cameras, config=config.match, cache=opened.surfaces
+            )
         num_moved = int((known.masks.instance_ids != checked.instance_ids).sum())
         known = known.with_masks(split_merged(checked) if config.split_merged else checked)
     has_surfaces = config.reconstruct is not None and config.reconstruct.shape != "voxels"
-    surfaces = _fit_surfaces(known) if has_surfaces else None
+    surfaces = _fit_surfaces(known, same_segmenter) if has_surfaces else None
     shown = surfaces or known.instances.starts
     left, fates = settle(known.edits, known.refused, known.left, shown, cameras=known.scene.cameras)
     for fate in fates:
@@ -85,12 +92,18 @@ def shape_leaves(known: Known) -> Result:
     )
 
 
-def _fit_surfaces(known: Known) -> Mapping[int, LeafSurface]:
-    from mvseg.reconstruction.surface.kept_surfaces import fit_kept
+def _fit_surfaces(known: Known, same_segmenter: Mapping[int, LeafSurface] | None) -> dict[int, LeafSurface]:
+    from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 
     with timed("surfaces"):
-        masks, starts = known.masks, known.instances.starts
-        return fit_kept(masks.regions, masks.instance_ids, known.scene.cameras, starts=starts)
+        return fit_surfaces(
+            known.masks.regions,
+            known.masks.instance_ids,
+            known.scene.cameras,
+            starts=known.instances.starts,
+            same_segmenter=same_segmenter,
+            cache=known.opened.surfaces,
+        )
 
 
 def _find_missing(known: Known, result: Result) -> Missing | None:

@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.config import ENOUGH_VIEWS, RunConfig
@@ -21,6 +23,7 @@ from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.masks import Masks
 from mvseg.matching.match import check_baselines
 from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
@@ -39,6 +42,8 @@ class Opened:
         views_left_out: names of the other views.
         config: the options of all stages.
         inputs: {file or folder: SHA-256 as it was read} of cameras and masks, or of the detector's weights.
+        surfaces: cache of what was fitted to masks of the scene.
+        snapped: {digest of a mask and the photo around it: the mask with edges of colour}, see `snap_masks`.
     """
 
     scene: Scene
@@ -48,6 +53,8 @@ class Opened:
     views_left_out: tuple[str, ...]
     config: RunConfig
     inputs: Mapping[Path, str] = field(default_factory=dict)
+    surfaces: SurfaceCache = field(default_factory=SurfaceCache)
+    snapped: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:

@@ -14,10 +14,10 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.errors import check_arguments, note_warnings
+from mvseg.errors import check_arguments, collect_warnings, note_warnings
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import pack_known
-from mvseg.pipeline.finish import finish
+from mvseg.pipeline.finish import finish, shape_leaves
 from mvseg.pipeline.known import match_given
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.results.result import Result
@@ -57,7 +57,7 @@ def run_scene(
         corrections = load_corrections(corrections)
     edits = None if corrections is None else corrections.source
     read = {} if edits is None else {edits: hash_files(edits)}
-    with running(keep=True) as now, TemporaryDirectory() as place:
+    with running() as now, TemporaryDirectory() as place:
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
             check_made_for(corrections, opened.photos)
@@ -72,7 +72,11 @@ def run_scene(
                 known = find_in_photos(opened, cache=kept)
                 known = learn(known, cache=kept, corrections=corrections)
                 kept.delete_others()
-        result = finish(apply_edits(known, corrections))
-        before = pack_known(known, said)
+        edited, before = apply_edits(known, corrections), None
+        if edited.edits:
+            with collect_warnings():  # of masks that nobody sees any more
+                before = shape_leaves(known).surfaces
+        result = finish(edited, same_segmenter=before)
+        packed = pack_known(known, said)
     inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
-    return replace(result, corrections=corrections, before_edits=before, seconds=now.seconds, inputs=inputs)
+    return replace(result, corrections=corrections, before_edits=packed, seconds=now.seconds, inputs=inputs)

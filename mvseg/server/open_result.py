@@ -6,7 +6,7 @@ import os
 import re
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -20,6 +20,7 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor
 
+from mvseg.corrections.as_seen import name_each
 from mvseg.corrections.file import Corrections, Point, load_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
@@ -36,7 +37,7 @@ from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
-from mvseg.reconstruction.surface.kept_surfaces import name_each
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import stack_regions
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.read import load_result
@@ -92,6 +93,7 @@ class OpenResult:
         self.answers = {"outline": self.outline}
         self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
+        self._before: tuple[Known, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
         self.learned: tuple[Known, list[str]] | None = None  # what is known since the detector learned the plant
 
     @property
@@ -177,9 +179,8 @@ class OpenResult:
         and, as sentences, the warnings on the way that the run did not give: those are on the page. Leaves keep their
         numbers from one result to the next, see `keep_numbers`.
 
-        Where what was computed is kept (`running`), a surface is fitted anew only if its instance's masks differ from
-        those in all results before. (A run from the command line fits all of them: each surface also depends a little
-        on the masks that may hide it.)
+        The result is that of `mvseg infer --again`, bit for bit: what was fitted before is taken where it would be
+        fitted to the same.
 
         Raises:
             Cancelled: `is_old`, which is asked between the stages, said so.
@@ -188,7 +189,7 @@ class OpenResult:
         known, messages = self._now_known
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(known, corrections)
-            result = shape_leaves(edited)
+            result = shape_leaves(edited, same_segmenter=self._fit_before(known) if edited.edits else None)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
         told = {_without_numbers(text) for text in (*self.run.said.warnings, *(fate.message for fate in shown.fates))}
         new = [text for text in dict.fromkeys(messages + more) if _without_numbers(text) not in told]
@@ -269,6 +270,13 @@ class OpenResult:
         with collect_warnings() as messages:
             known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
         return known, messages
+
+    def _fit_before(self, known: Known) -> Mapping[int, LeafSurface] | None:
+        """The surfaces before edits, which tell how the masks err."""
+        if self._before is None or self._before[0] is not known:
+            with collect_warnings():
+                self._before = known, shape_leaves(known).surfaces
+        return self._before[1]
 
     @cached_property
     def _seen(self) -> Known:

@@ -95,8 +95,7 @@ def running(
     Args:
         progress: show progress bars; None: as outside.
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
-        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept` and
-            `kept`.
+        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `kept`.
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
         report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
             None: as outside.

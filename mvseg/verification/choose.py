@@ -19,6 +19,7 @@ from torch import Tensor
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.choice import Chosen, Said, choose
 from mvseg.verification.evidence import Bools, Drawn, draw_views
@@ -64,6 +65,7 @@ def choose_leaves(
     seen: Tensor | None = None,
     drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
+    cache: SurfaceCache | None = None,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
@@ -83,6 +85,7 @@ def choose_leaves(
             None: for none.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
+        cache: of surfaces, see `fit_surfaces`.
 
     Returns:
         The leaves. Where the cameras see the plant from one side only, by less than `ROUGH.least_parallax`, surfaces
@@ -110,7 +113,9 @@ def choose_leaves(
     found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
     is_edited = gone is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
     has_shapes = _is_seen_around(more[0].to("cpu") if is_edited else matched, cameras)
-    candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
+    candidates = gather_candidates(
+        found, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache
+    )
     views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
     is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
     for each in views:
@@ -175,6 +180,7 @@ def gather_candidates(
     table: Masks,
     is_held: Tensor,
     surfaces: Mapping[int, LeafSurface] | None = None,
+    cache: SurfaceCache | None = None,
 ) -> Candidates:
     """The instances of each matching; those that an earlier one has, too, once.
 
@@ -184,6 +190,7 @@ def gather_candidates(
         table: R' masks.
         is_held: (D,) bool, of the masks of the first matching.
         surfaces: {instance id: surface} of the first matching; None: they are fitted here.
+        cache: see `fit_surfaces`.
     """
     areas = table.regions.areas.double()
     shapes: list[LeafSurface | None] = []
@@ -198,7 +205,7 @@ def gather_candidates(
         if number == 0 and surfaces is not None:
             fitted = surfaces
         elif cameras is not None:
-            fitted = fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras)
+            fitted = fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras, cache)
         for each in new:
             own = ids == each
             members.append(rows[own])

@@ -24,12 +24,11 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.kept_surfaces import name_fit
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
-from mvseg.system.running import now_running
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.numbers import DRAWN, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
@@ -46,6 +45,7 @@ def follow_drawn(
     cameras: Cameras,
     photos: ReadPhoto | None,
     colors: Frame | None = None,
+    cache: SurfaceCache | None = None,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
@@ -59,6 +59,7 @@ def follow_drawn(
         cameras: V cameras.
         photos: of the views. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
+        cache: see `fit_surfaces`.
 
     Returns:
         The D masks on the CPU in their order, without half masks, and the new ones after them. And {instance id:
@@ -76,10 +77,10 @@ def follow_drawn(
     surfaces: dict[int, LeafSurface] = {}
     for leaf in followed:
         if photos is not None:
-            masks = _drop_halves(masks, leaf, colored, cameras=cameras)
+            masks = _drop_halves(masks, leaf, colored, cameras=cameras, cache=cache)
         if not _views_without(masks, leaf):
             continue
-        surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras)
+        surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras, cache=cache)
         if surface.is_credible:
             surfaces[leaf] = surface
             masks = _show(masks, leaf, surface, cameras=cameras, colored=colored)
@@ -115,7 +116,9 @@ def _maybe_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cam
     return maybe
 
 
-def _drop_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras) -> Masks:
+def _drop_halves(
+    masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras, cache: SurfaceCache | None
+) -> Masks:
     """The masks without those that show half a leaf: the surface that follows from what was drawn alone holds them, and
     the view shows more than twice as much of it openly, all in the colour of leaves."""
     maybe = _maybe_halves(masks, leaf, colored, cameras=cameras)
@@ -124,7 +127,7 @@ def _drop_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Came
     certain = (masks.instance_ids == leaf) & (masks.is_corrected | masks.is_linked)
     free = (masks.instance_ids == leaf) & ~certain
     alone = replace(masks, instance_ids=masks.instance_ids.where(~free, -1))
-    surface = _fit(alone, leaf, colored, cameras=cameras)
+    surface = _fit(alone, leaf, colored, cameras=cameras, cache=cache)
     if not surface.is_credible:
         return masks
     shown = _find_open(alone, leaf, surface, cameras=cameras, colored=colored)
@@ -136,7 +139,9 @@ def _drop_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Came
     return masks.select(stays)
 
 
-def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras) -> LeafSurface:
+def _fit(
+    masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras, cache: SurfaceCache | None
+) -> LeafSurface:
     """The surface of a leaf from its masks and, where they and the colours agree, from what may be its parts in the
     other views; all other masks may hide it."""
     regions = masks.regions
@@ -147,7 +152,7 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
         ids = torch.cat((alone, torch.full((len(parts),), leaf)))
         more = _with_parts(regions, parts)
         starts = {} if start is None else {leaf: start}
-        return fit_surfaces(more, ids, cameras, starts=starts)[leaf]
+        return fit_surfaces(more, ids, cameras, starts=starts, cache=cache)[leaf]
 
     others = _views_without(masks, leaf)
     if colored is None or not others:
@@ -155,10 +160,6 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in others})
     left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in around}
     parts = _find_parts(left, around)
-    kept, name = now_running().kept, name_fit(_with_parts(own, parts), cameras, how=f"{DRAWN} {EVIDENCE}")
-    if kept is not None and name in kept:  # what else hides it, may have changed, as in `fit_kept`
-        found: LeafSurface = kept[name]
-        return found
     best = None
     for _ in range(DRAWN.rounds):
         if not parts:
@@ -170,8 +171,6 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
     is_own = None if best is None else torch.isin(best.views, own.view_index)
     if best is None or is_own is None or float(best.iou[is_own].min()) < EVIDENCE.fits:  # the outlines are certain
         best = fit({}, None)
-    if kept is not None:
-        kept[name] = best
     return best
 
 

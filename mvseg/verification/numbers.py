@@ -30,20 +30,10 @@ class RoughNumbers:
 
 @dataclass(frozen=True)
 class PartNumbers:
-    """Masks and instances that show a part of a leaf, and masks that show two.
+    """Masks that show two leaves."""
 
-    Without `often_split` and `most_split`, 12 right masks of a real basil of 44 leaves move, and its ARI falls from
-    0.923 to 0.854; without `touches`, two right ones of straps in pieces do (docs/notes/matching.md).
-    """
-
-    piece_inside: float = 0.8  # fraction of a piece of a leaf that lies in what is seen of the leaf, at least
     each: float = 0.2  # fraction of a mask that each of the two leaves it shows covers, at least
     both: float = 0.7  # and both together
-    few_views: float = 0.75  # fraction of the views that show an instance which may be a part of a leaf, at most
-    often_split: float = 0.1  # fraction of instances with several masks in a view from which pieces are the rule
-    most_split: int = 1  # views with masks of both of two instances that may be one leaf, at most, where they are not
-    touches: float = 0.02  # distance of two surfaces that touch, as a fraction of the length of the part, at most
-    as_near: float = 1.1  # distance of the outline of one surface that fits as well as two, in theirs, at most
 
 
 @dataclass(frozen=True)

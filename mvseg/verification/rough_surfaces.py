@@ -6,17 +6,20 @@ import torch
 
 from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
-from mvseg.reconstruction.surface.kept_surfaces import fit_kept
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.numbers import ROUGH
 
 
-def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:
+def fit_roughly(masks: Masks, cameras: Cameras, cache: SurfaceCache | None = None) -> dict[int, LeafSurface]:
     """{instance id: surface} to verify masks with. It does not warn: what still holds after the correction is said
     then."""
     with collect_warnings():
-        return fit_kept(masks.regions, masks.instance_ids, cameras, most_views=ROUGH.views, is_rough=True)
+        return fit_surfaces(
+            masks.regions, masks.instance_ids, cameras, most_views=ROUGH.views, is_rough=True, cache=cache
+        )
 
 
 def median_parallax(masks: Masks, cameras: Cameras) -> float:

@@ -18,6 +18,7 @@ import torch
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.choice import same_class
 from mvseg.verification.choose import gather_candidates
@@ -75,11 +76,12 @@ class Question:
         *,
         is_held: Bools,
         more: Sequence[Masks] = (),
+        cache: SurfaceCache | None = None,
     ) -> Question:
         """About the instances of masks with their surfaces, and those of `more`, the same masks with other ids."""
         found = [(each, torch.arange(len(masks))) for each in (masks, *more)]
         held = torch.from_numpy(is_held)
-        candidates = gather_candidates(found, cameras, table=masks, is_held=held, surfaces=surfaces)
+        candidates = gather_candidates(found, cameras, table=masks, is_held=held, surfaces=surfaces, cache=cache)
         ids = masks.instance_ids.numpy()
         names = np.unique(ids[ids > 0])
         return Question(
@@ -99,12 +101,13 @@ def ask(
     config: MatchConfig,
     is_held: Bools,
     fitted: GivenScores = GIVEN,
+    cache: SurfaceCache | None = None,
 ) -> Question:
     """What to ask of D matched masks on the CPU, also of the instances that the matcher finds once more."""
     first = Question.of(masks, surfaces, cameras, is_held=is_held)
     odds = show_odds(first, fitted)[np.arange(len(masks)), first.leaf]
     more = match_again(masks, first.leaf, odds=odds, cameras=cameras, config=config)
-    return Question.of(masks, surfaces, cameras, is_held=is_held, more=more) if more else first
+    return Question.of(masks, surfaces, cameras, is_held=is_held, more=more, cache=cache) if more else first
 
 
 def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:

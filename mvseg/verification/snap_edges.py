@@ -7,6 +7,7 @@ what lies deeper inside stays leaf, what lies farther outside stays background. 
 
 from __future__ import annotations
 
+import hashlib
 import math
 
 import cv2
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
-from mvseg.system.running import kept
 from mvseg.verification.numbers import SNAP
 
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
@@ -26,7 +26,7 @@ Pixels = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 
-def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
+def snap_masks(masks: Masks, photos: ReadPhoto, *, cache: dict[str, Bools] | None = None) -> Masks:
     """Move the edges of the masks that a detector found to those of colour, see `snap`.
 
     None grows into another mask of its view, nor do two grow into the same pixel: the first row has it.
@@ -34,10 +34,12 @@ def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
     Args:
         masks: D masks.
         photos: of the views.
+        cache: {digest of the arguments of `snap`: what it returned}; earlier ones are taken from it, new ones added.
 
     Returns:
         The same rows, on the CPU. Masks that no detector found, and those that show two instances, stay as they are.
     """
+    cache = {} if cache is None else cache
     regions = masks.regions.to("cpu")
     moves = (torch.isin(masks.origin, FOUND.to(masks.origin)) & (masks.second_ids < 0)).cpu()
     crops = [regions.placed(row) for row in range(len(regions))]
@@ -54,13 +56,16 @@ def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
             x2, y2 = (min(size, high + room) for size, high in zip(photo.shape[1::-1], crops[row].box[2:], strict=True))
             around = crops[row].within((x1, y1, x2, y2))
             mask, shown = around.pixels.numpy(), around.cut(taken)
-            snapped = snap(mask, around.cut(photo), others=shown & ~mask)
+            asked = mask, around.cut(photo), shown & ~mask
+            digest = hashlib.sha256(b"".join(f"{each.shape}".encode() + each.tobytes() for each in asked)).hexdigest()
+            if digest not in cache:
+                cache[digest] = snap(*asked[:2], others=asked[2])
+            snapped = cache[digest]
             shown |= snapped
             crops[row] = Crop.of(snapped, (x1, y1))
     return replace_crops(masks, crops)
 
 
-@kept
 def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
     """The mask whose edge lies where colours change, within `SNAP.band` of where it was.
 
@@ -70,8 +75,7 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
         others: (H, W) bool, disjoint from the mask: what other masks show.
 
     Returns:
-        (H, W) bool. The mask as it is, where too little of it lies deep inside, or nothing is around it. Found once for
-        the same mask and photo where the run keeps what it computed.
+        (H, W) bool. The mask as it is, where too little of it lies deep inside, or nothing is around it.
     """
     height, width = mask.shape
     scale = min(1.0, SNAP.most_px / max(math.sqrt(mask.sum()), 1.0))

@@ -23,8 +23,8 @@ from mvseg.pipeline.before_edits import MOST_BYTES, pack_known, unpack_known
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import Approach
 from mvseg.scene import Cameras, Scene, View
-from mvseg.system.running import running
 from mvseg.verification import choose as choosing
 from mvseg.verification.choose import Leaves
 from mvseg.verification.evidence import Drawn
@@ -46,7 +46,7 @@ SCENE = Scene(name="plant", views=VIEWS, cameras=CAMERAS, unit="mm", up=None)
 FOUND = FoundMasks(Matching(MATCHED.select(IDS != WEAK), MatchReport("nview")), PROPOSALS, more=MATCHED)
 
 
-def fit(masks: Masks, _: Cameras) -> dict[int, LeafSurface]:
+def fit(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:
     ids = masks.instance_ids
     instances = ids[ids > 0].unique().tolist()
     return {each: LEAVES[int(IDS[masks.regions.labels[ids == each]].mode().values)] for each in instances}
@@ -80,18 +80,23 @@ def as_painted(state: Known) -> list[np.ndarray]:
 
 def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -> None:
     opened, reject = open_photos(SCENE), Corrections((Reject(view="v0", at=at(WEAK, 0), everywhere=True),))
-    with running(keep=True) as now:
-        assert now.kept is not None
-        now.kept.update({"surface": LEAVES[1], "edge": REGIONS.crop(0).numpy()})
-        content = pack_known(find_in_photos(opened), ["odd"])
-        assert content is not None
-    with running(keep=True) as now:
-        found = unpack_known(content, opened)
-        assert found is not None
-        known, said = found
-        assert now.kept is not None
-        np.testing.assert_array_equal(now.kept["edge"], REGIONS.crop(0).numpy())
-        assert torch.equal(now.kept["surface"].covariance, LEAVES[1].covariance)
+    approach = Approach(LEAVES[1].views, LEAVES[1].coefficients, LEAVES[1].offsets_px, spread=0.5)
+    opened.surfaces.surfaces["name"] = LEAVES[1]
+    opened.surfaces.approaches.update({"one": approach, "other": None})
+    opened.snapped["edge"] = REGIONS.crop(0).numpy()
+    content = pack_known(find_in_photos(opened), ["odd"])
+    assert content is not None
+    found = unpack_known(content, open_photos(SCENE))
+    assert found is not None
+    known, said = found
+    cache = known.opened.surfaces
+    np.testing.assert_array_equal(known.opened.snapped["edge"], REGIONS.crop(0).numpy())
+    assert torch.equal(cache.surfaces["name"].covariance, LEAVES[1].covariance)
+    again = cache.approaches["one"]
+    assert again is not None
+    assert again.spread == 0.5
+    assert torch.equal(again.coefficients, approach.coefficients)
+    assert cache.approaches["other"] is None
     before = run()
     assert said == ["odd"]
     assert known.instances.probabilities == before.instances.probabilities

@@ -14,7 +14,6 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, start_in
 from mvseg.reconstruction.surface.hull import Hull
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import paint_view
 
 FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
 CAMERAS = ring_cameras(10)
@@ -123,25 +122,6 @@ def test_a_rough_fit_is_the_first_of_two_and_nearly_as_good(bent: LeafSurface, m
     assert rough[1].is_credible
     assert rough[1].area == pytest.approx(bent.area, rel=0.02)
     assert np.abs(errors(rough[1], BENT)).max() < 0.03
-    assert fit_surfaces(regions, ids, CAMERAS, known=rough, is_rough=True)[1] is rough[1]
-
-
-def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras = CAMERAS[[0, 2, 4, 6, 8]]
-    leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),
-              2: flat_leaf(length=1.4, half_width=0.35, at=(-0.6, 0.1, 0.0))}  # fmt: skip
-    maps = [paint_view(leaves, cameras, view) for view in range(len(cameras))]
-    regions, ids = as_regions(maps)
-    both = fit_surfaces(regions, ids, cameras)
-    gone = LeafSurface.none(torch.arange(2), "a reason")
-    again = fit_surfaces(regions, ids, cameras, known={1: both[1]})
-    assert again[1] is both[1]
-    assert all(len(each.offsets_px) == len(each.views) for each in both.values())
-    assert torch.allclose(again[2].points(), both[2].points(), atol=5e-3)
-    assert again[2].area == pytest.approx(both[2].area, rel=2e-3)
-    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.carve_hull", None)
-    kept = {1: gone, 2: both[2]}
-    assert fit_surfaces(regions, ids, cameras, known=kept) == kept
 
 
 def test_one_wrong_mask_in_five_does_little_harm() -> None:

@@ -39,7 +39,7 @@ def matched_of(proposals: Masks, ids: torch.Tensor, rows: torch.Tensor | None = 
     return replace(chosen, instance_ids=ids, match_scores=torch.where(ids > 0, score, 0.0))
 
 
-def fit(masks: Masks, _: Cameras) -> dict[int, LeafSurface]:
+def fit(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:
     """The known leaves, by most of the masks."""
     found = {}
     for instance in masks.instance_ids[masks.instance_ids > 0].unique().tolist():
@@ -264,7 +264,7 @@ def test_a_probability_of_ones_own() -> None:
 
 
 def test_without_surfaces_matching_and_scores_decide() -> None:
-    leaves = choose(matched_of(PROPOSALS, IDS), fit=lambda masks, _: {})
+    leaves = choose(matched_of(PROPOSALS, IDS), fit=lambda *_: {})
     assert same_partition(leaves)
     assert leaves.surfaces == {}
 

@@ -14,7 +14,6 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
-from mvseg.system.running import running
 from mvseg.verification.numbers import SNAP
 from mvseg.verification.snap_edges import snap, snap_masks
 
@@ -119,10 +118,10 @@ def test_edges_that_did_not_change_are_not_looked_for_again(monkeypatch: pytest.
     photos = [paint(leaf.astype(int)), paint(leaf.astype(int), seed=1)].__getitem__
     whole, grab = snap_masks(masks, photos), cv2.grabCut
     monkeypatch.setattr(cv2, "grabCut", lambda *args: (cut.append(1), grab(*args)))
-    with running(keep=True):
-        for table, calls in ((masks, 2), (masks, 2), (replace(masks, regions=regions.select(torch.tensor([1, 0]))), 2)):
-            again = snap_masks(table, photos)
-            assert len(cut) == calls
+    cache: dict[str, np.ndarray] = {}
+    for table in (masks, masks, replace(masks, regions=regions.select(torch.tensor([1, 0])))):
+        again = snap_masks(table, photos, cache=cache)
+        assert len(cut) == 2
     monkeypatch.setattr(cv2, "grabCut", grab)
     assert torch.equal(again.select(torch.tensor([1, 0])).regions.crops, whole.regions.crops)
 

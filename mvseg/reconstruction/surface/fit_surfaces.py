@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +30,11 @@ from mvseg.reconstruction.surface.patch_image import (
     draw_patch,
     hiding_pixels,
     project_points,
+    select_hiding,
     view_ious,
 )
 from mvseg.reconstruction.surface.patch_start import start_patches
+from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache, name_first, name_second
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
@@ -45,9 +48,10 @@ def fit_surfaces(
     cameras: Cameras,
     *,
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
-    known: Mapping[int, LeafSurface] = MappingProxyType({}),
+    same_segmenter: Mapping[int, LeafSurface] | None = None,
     most_views: int | None = None,
     is_rough: bool = False,
+    cache: SurfaceCache | None = None,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
@@ -59,11 +63,12 @@ def fit_surfaces(
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
-        known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
-            them: it hides what lies behind it, and its `offsets_px` tell how all masks err.
+        same_segmenter: surfaces whose `offsets_px` tell how the masks err; None: those that are fitted here. With those
+            of a scene before edits, an edit of one leaf does not move all others a little.
         most_views: at least 2; None: `SEARCH.most_views`.
         is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err, and
             the reasons to doubt a surface.
+        cache: fits of earlier calls are taken from it, and new ones added; no surface differs by it in any bit.
 
     Returns:
         {instance id: surface} for every instance. Where no surface can be fitted (one view, masks that agree on no
@@ -74,16 +79,13 @@ def fit_surfaces(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    cache = SurfaceCache() if cache is None else cache
     workers = now_running().workers if len(regions) >= SEARCH.few_masks else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = _instance_frames(regions, instance_ids, cameras)
-    stacks: dict[int, MaskStack] = {}
-    fits: dict[int, PatchFit] = {}
     surfaces: dict[int, LeafSurface] = {}
-    unfitted: dict[int, tuple[MaskStack, Floats | None]] = {}
+    asked: dict[int, _Asked] = {}
     for instance in _ids(instance_ids):
-        if instance in known:
-            continue
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
         if len(views) < 2:
@@ -93,33 +95,75 @@ def fit_surfaces(
         members = members.select(torch.isin(members.view_index, views[spread_views(cameras[views], most)]))
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
-        unfitted[instance] = _stack(members, cameras, frames, instance=instance), rough
-    answers = map_in_order(partial(_fit_first, is_rough=is_rough), unfitted.values(), workers)
-    shown = progress_bar(answers, "fitting surfaces", len(unfitted), unit="instance")
-    for instance, (masks, fit) in zip(unfitted, shown, strict=True):
-        stacks[instance] = masks
-        if fit is None:
-            views = torch.from_numpy(unfitted[instance][0].views)
-            surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
-        else:
-            fits[instance] = fit
-    first = dict(fits)
-    if not is_rough:
-        there: dict[int, PatchFit | LeafSurface] = {**fits, **{n: each for n, each in known.items() if each.exists}}
-        ordered = dict(sorted(there.items()))
-        offsets = [np.asarray(each.offsets_px) for each in ordered.values()]
-        finite = [each[np.isfinite(each)] for each in offsets]
-        errors = learn_mask_errors([each for each in finite if len(each) > 1])
-        points = {n: patch_grid(*FIT.grid).points(np.asarray(each.coefficients)) for n, each in ordered.items()}
-        asked = [(instance, stacks[instance], fit) for instance, fit in first.items()]
-        refitted = map_in_order(partial(_fit_again, points, errors), asked, workers)
-        for instance, (masks, better) in zip(first, refitted, strict=True):
-            stacks[instance], fits[instance] = masks, better
-    for instance, fit in fits.items():
-        offsets_px = first[instance].offsets_px
-        surfaces[instance] = _surface(stacks[instance], fit, offsets=offsets_px, is_judged=not is_rough)
-    oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
-    return {**oriented, **known}
+        masks = _stack(members, cameras, frames, instance=instance)
+        asked[instance] = _Asked(name_first(masks, rough), masks, rough)
+    first = {each.name: each for each in asked.values()}
+    if is_rough:
+        names = {instance: f"rough {each.name}" for instance, each in asked.items()}
+        _fit_new(cache.surfaces, {f"rough {name}": each for name, each in first.items()}, _fit_roughly, workers)
+    else:
+        _fit_new(cache.approaches, first, _fit_first, workers)
+        again = _ask_again(asked, cache, same_segmenter)
+        names = {instance: each.name for instance, each in again.items()}
+        _fit_new(cache.surfaces, {each.name: each for each in again.values()}, _fit_again, workers)
+    for instance, each in asked.items():
+        nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "its masks agree on no point")
+        surfaces[instance] = cache.surfaces[names[instance]] if instance in names else nothing
+    oriented = orient_surfaces(dict(sorted(surfaces.items())), cameras)
+    return {n: cache.orient(names[n], each) if n in names else each for n, each in oriented.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A leaf to be fitted: the name of that fit, its masks, and a start if there is one."""
+
+    name: str
+    masks: MaskStack
+    start: Floats | None
+
+
+@dataclass(frozen=True, eq=False)
+class _AskedAgain:
+    """A leaf to be fitted for the second time: how its masks err, and the grids (rows, columns, 3) of those leaves that
+    may hide it."""
+
+    name: str
+    masks: MaskStack
+    approach: Approach
+    errors: MaskErrors | None
+    others: Mapping[int, Floats]
+
+
+def _fit_new(
+    cache: dict[str, Any], asked: Mapping[str, Any], fit: Callable[[Any], Any], workers: ProcessPoolExecutor | None
+) -> None:
+    """Fit what is not in the cache yet."""
+    new = {name: each for name, each in asked.items() if name not in cache}
+    answers = map_in_order(fit, new.values(), workers)
+    name = "refining surfaces" if fit is _fit_again else "fitting surfaces"
+    for each, answer in zip(new, progress_bar(answers, name, len(new), unit="instance"), strict=True):
+        cache[each] = answer
+
+
+def _ask_again(
+    asked: Mapping[int, _Asked], cache: SurfaceCache, same_segmenter: Mapping[int, LeafSurface] | None
+) -> dict[int, _AskedAgain]:
+    """The second fits, of the leaves whose first one found something."""
+    found = {instance: cache.approaches[each.name] for instance, each in asked.items()}
+    approaches = {instance: each for instance, each in found.items() if each is not None}
+    measured: Mapping[int, Approach | LeafSurface] = approaches if same_segmenter is None else same_segmenter
+    offsets = [measured[instance].offsets_px.numpy() for instance in sorted(measured)]
+    finite = [each[np.isfinite(each)] for each in offsets]
+    errors = learn_mask_errors([each for each in finite if len(each) > 1])
+    points = {n: patch_grid(*FIT.grid).points(each.coefficients.numpy()) for n, each in approaches.items()}
+    again = {}
+    for instance, approach in approaches.items():
+        masks = asked[instance].masks
+        masks = masks.select(np.isin(masks.views, approach.views.numpy()))
+        near = select_hiding(masks, points[instance], {n: grid for n, grid in points.items() if n != instance})
+        name = name_second(asked[instance].name, masks, approach, near, errors=errors)
+        again[instance] = _AskedAgain(name, masks, approach, errors, near)
+    return again
 
 
 def _ids(instance_ids: Tensor) -> list[int]:
@@ -134,12 +178,27 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-def _fit_first(asked: tuple[MaskStack, Floats | None], *, is_rough: bool) -> tuple[MaskStack, PatchFit | None]:
-    """The first fit of an instance, from a start that is nearly right or from those that are found, and its masks.
+def _fit_roughly(asked: _Asked) -> LeafSurface:
+    masks, fit = _approach(asked, is_rough=True)
+    if fit is None:
+        return LeafSurface.none(torch.from_numpy(asked.masks.views), "its masks agree on no point")
+    return _surface(masks, fit, offsets=fit.offsets_px, is_judged=False)
+
+
+def _fit_first(asked: _Asked) -> Approach | None:
+    masks, fit = _approach(asked, is_rough=False)
+    if fit is None:
+        return None
+    views, coefficients, offsets_px = map(torch.from_numpy, (masks.views, fit.coefficients, fit.offsets_px))
+    return Approach(views=views, coefficients=coefficients, offsets_px=offsets_px, spread=fit.spread)
+
+
+def _approach(asked: _Asked, *, is_rough: bool) -> tuple[MaskStack, PatchFit | None]:
+    """The masks that show the leaf, and a fit from a start that is nearly right or from those that are found.
 
     Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
     """
-    masks, start = asked
+    masks, start = asked.masks, asked.start
     masks, starts = (masks, [start]) if start is not None else _find_starts(masks, is_rough=is_rough)
     fits = [fit_patch(masks, each, num_steps=SEARCH.first_steps) for each in starts]
     if len(fits) < 2:
@@ -159,17 +218,17 @@ def _find_starts(masks: MaskStack, *, is_rough: bool) -> tuple[MaskStack, list[F
     that seems to explain them: so others than the likeliest are only tried where that ends badly. The first hull asks
     that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
-    axes = masks.axes
+    given, axes = masks, masks.axes
     masks = masks.turn_world(axes)
     hull = carve_hull(masks)
     seen = hull.points[hull.is_seen] if hull.is_seen.any() else hull.points
     if len(seen):
         is_right = ~find_wrong_masks(masks, seen)
         if not is_right.all():
-            masks = masks.select(is_right)
+            given, masks = given.select(is_right), masks.select(is_right)
             hull = carve_hull(masks)
     if not len(hull.points):
-        return masks.turn_world(axes.T), []
+        return given, []
     few = _few_views(masks, hull.points.mean(0))
     found = _Found()
     for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
@@ -179,7 +238,7 @@ def _find_starts(masks: MaskStack, *, is_rough: bool) -> tuple[MaskStack, list[F
         for starts in (likely[:1], likely[1:]) if is_rough else (likely,):
             found = found if found.is_good else _try_starts(few, starts, found)
     best = found.likely_best() if is_rough else found.best(SEARCH.most_fits)
-    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in best]
+    return given, [found.patches[index] @ axes for index in best]
 
 
 def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
@@ -305,17 +364,14 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
     )
 
 
-def _fit_again(
-    points: Mapping[int, Floats], errors: MaskErrors | None, asked: tuple[int, MaskStack, PatchFit]
-) -> tuple[MaskStack, PatchFit]:
-    """A leaf fitted to what is its rim, now that all leaves (`points` of their grids) and the errors of the masks are
-    known."""
-    instance, masks, fit = asked
-    margin = SEARCH.behind * measure_patch(fit.coefficients).length
-    others = {other: grid for other, grid in points.items() if other != instance}
-    hiding = hiding_pixels(masks, points[instance], others, margin=margin)
-    masks = replace(masks, others=hiding)
-    return masks, replace(fit_patch(masks, fit.coefficients, num_steps=FIT.num_steps, errors=errors), spread=fit.spread)
+def _fit_again(asked: _AskedAgain) -> LeafSurface:
+    """A leaf fitted to what is its rim, now that all leaves and the errors of the masks are known."""
+    first, masks, errors = asked.approach, asked.masks, asked.errors
+    coefficients = first.coefficients.numpy()
+    points, margin = patch_grid(*FIT.grid).points(coefficients), SEARCH.behind * measure_patch(coefficients).length
+    masks = replace(masks, others=hiding_pixels(masks, points, asked.others, margin=margin))
+    fit = fit_patch(masks, coefficients, num_steps=FIT.num_steps, errors=errors)
+    return _surface(masks, replace(fit, spread=first.spread), offsets=first.offsets_px.numpy(), is_judged=True)
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:

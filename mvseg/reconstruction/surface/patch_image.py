@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 
@@ -163,11 +163,36 @@ def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.floa
     return share / np.float32(255)
 
 
-def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *, margin: float) -> NDArray[np.int32]:
+def select_hiding(masks: MaskStack, points: Floats, others: Mapping[int, Floats]) -> dict[int, Floats]:
+    """Those of the others that can change an answer of `hiding_pixels`: in some view, their grid or a pixel that shows
+    them comes near the leaf's grid or mask."""
+    px = project_points(masks.px_from_world, points).px.reshape(len(masks), -1, 2)
+    low, high = px.min(1), px.max(1)
+    for view, inside in enumerate(masks.inside):
+        (rows, columns), room = np.nonzero(inside), IMAGE.near_px + 1
+        if len(rows):
+            low[view] = np.minimum(low[view], (columns.min(), rows.min())) - room
+            high[view] = np.maximum(high[view], (columns.max(), rows.max())) + room
+    first = np.clip(np.floor(low), 0, None).astype(int)
+    last = np.clip(np.ceil(high), 0, None).astype(int) + 1
+    around = zip(masks.others, first.tolist(), last.tolist(), strict=True)
+    shown = {int(each) for crop, (x1, y1), (x2, y2) in around for each in np.unique(crop[y1:y2, x1:x2])}
+    near = {}
+    for other, grid in others.items():
+        image = project_points(masks.px_from_world, grid).px.reshape(len(masks), -1, 2)
+        if other in shown or ((image.max(1) >= low).all(1) & (image.min(1) <= high).all(1)).any():
+            near[other] = grid
+    return near
+
+
+def hiding_pixels(
+    masks: MaskStack, points: Floats, others: Mapping[int, Floats], *, margin: float
+) -> NDArray[np.int32]:
     """(S, H, W) int32: which instance hides the leaf there, 0 for none, as the surfaces have it.
 
     A pixel that shows another instance hides nothing where that one's surface lies behind the leaf. And a surface in
-    front of the leaf hides it, whether that instance has a mask there or not.
+    front of the leaf hides it, whether that instance has a mask there or not. The order of the others does not matter,
+    but for which of several ids a pixel has.
 
     Args:
         masks: of the leaf.
@@ -183,21 +208,31 @@ def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *
     for index, crop in enumerate(hiding):
         near = cv2.dilate(leaves[index], np.ones((2 * IMAGE.near_px + 1,) * 2, np.uint8)) > 0
         near &= ~masks.inside[index]
-        own = cKDTree(projection.px[index].reshape(-1, 2))
-        own_depth = projection.depth[index].ravel()
+        own, own_depth = cKDTree(projection.px[index].reshape(-1, 2)), projection.depth[index].ravel()
+        there = {}
         for other, image in seen.items():
-            px, depth = image.px[index].reshape(-1, 2), image.depth[index].ravel()
-            if (px.max(0) < 0).any() or (px.min(0) > size).any():
-                continue
+            px = image.px[index].reshape(-1, 2)
+            if (px.max(0) >= 0).all() and (px.min(0) <= size).all():
+                there[other] = cKDTree(px), image.depth[index].ravel()
+        behind = np.zeros(crop.shape, bool)
+        for other, surface in there.items():
+            shown = np.argwhere(near & (crop == other))
+            if len(shown):
+                behind[tuple(shown.T)] = _gaps(shown, surface, (own, own_depth)) > margin
+        crop[behind] = 0
+        for other, surface in there.items():
             canvas = np.zeros((size[1] * IMAGE.supersampled, size[0] * IMAGE.supersampled), np.uint8)
-            fill_grids([canvas], image.px[index : index + 1] * IMAGE.supersampled)
-            drawn = _shares(canvas, size) >= 0.5
-            shows = crop == other
-            row, column = np.nonzero(near & (shows | drawn & (crop == 0)))
-            if not len(row):
-                continue
-            place = np.stack([column, row], 1) + 0.5
-            gap = depth[cKDTree(px).query(place)[1]] - own_depth[own.query(place)[1]]
-            is_front = drawn[row, column] & (gap < -margin)
-            crop[row, column] = np.where(gap > margin, 0, np.where(is_front, other, crop[row, column]))
+            fill_grids([canvas], seen[other].px[index : index + 1] * IMAGE.supersampled)
+            drawn = np.argwhere(near & (crop == 0) & (_shares(canvas, size) >= 0.5))
+            if len(drawn):
+                crop[tuple(drawn[_gaps(drawn, surface, (own, own_depth)) < -margin].T)] = other
     return hiding
+
+
+def _gaps(places: NDArray[np.int64], surface: tuple[cKDTree, Floats], own: tuple[cKDTree, Floats]) -> Floats:
+    """(P,) how much farther away a surface is than another one, at pixels (P, 2) in rows and columns; each is given by
+    its points in the image and their depths."""
+    centres = places[:, ::-1] + 0.5
+    far, near = (depth[tree.query(centres)[1]] for tree, depth in (surface, own))
+    gaps: Floats = far - near
+    return gaps
