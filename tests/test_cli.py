@@ -715,7 +715,7 @@ def test_output_that_cannot_be_written(
     (tmp_path / "full" / "thesis.tex").touch()
     before = sorted(tmp_path.rglob("*"))
     assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / place), "--quiet"]) == 2
-    reason = "holds files that are not an earlier result" if place == "full" else "the output folder is not writable"
+    reason = "holds files that are not a result" if place == "full" else "the output folder is not writable"
     assert f"{tmp_path / place}: {reason}" in complaint(capsys)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -810,8 +810,8 @@ def test_another_scenes_result_is_replaced_only_when_asked_for(
     before = (place / "run.json").read_bytes()
     capsys.readouterr()
     assert main([*command, str(other)]) == 2
-    message = f"{place}: holds the result of another scene, {plant}, not of {other}"
-    assert complaint(capsys) == f"{message}; expected another --out, or --overwrite true"
+    message = f"{place}: holds a result of mvseg infer, match or batch, made of {plant}, not of {other}"
+    assert complaint(capsys) == f"{message}; expected another folder, or --overwrite true"
     assert (place / "run.json").read_bytes() == before
     (tmp_path / "link").symlink_to(plant)
     if verb == "infer":
