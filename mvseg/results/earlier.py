@@ -14,15 +14,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel
+from pydantic import BaseModel, Field
 
 from mvseg.errors import InputError
 from mvseg.system.atomic import folder_whole, is_partial, list_files, resolve_place, try_writing, write_text_whole
 from mvseg.system.file_hash import hash_files
 
 RUN_FILE, POSE_FILE = "run.json", "pose.json"
+_Name = Annotated[str, Field(pattern=r"^[^\x00]*$")]
 Kind = Literal["result", "tracks", "tables", "training", "scene"]
 KINDS: dict[str, str] = {
     "result": "a result of mvseg infer, match or batch",
@@ -63,14 +64,14 @@ class Output:
 
 class _Made(BaseModel):
     kind: Kind
-    of: dict[str, str | None] = {}
+    of: dict[_Name, _Name | None] = {}
 
 
 class _Run(BaseModel):
     """What a run file says, see `Output.describe`; that of an earlier version may say of its files only."""
 
     output: _Made | None = None
-    files: dict[str, str] | None = None
+    files: dict[_Name, str] | None = None
 
 
 RESULT = Output("result")

@@ -517,7 +517,8 @@ class TestWholeOrNotAtAll:
 class TestPlaces:
     def test_a_folder_of_other_files_is_refused(self, result: Result, tmp_path: Path) -> None:
         (tmp_path / "thesis.tex").write_text("ten years of work")
-        for run in (None, "", "{}", "[1]", '{"files": 3}', '{"mvseg": "0.1.0"}'):  # other programs write run.json, too
+        others = "", "{}", "[1]", '{"files": 3}', '{"files": {"\\u0000": ""}}', '{"mvseg": "0.1.0"}'
+        for run in (None, *others):  # other programs write run.json, too
             if run is not None:
                 (tmp_path / "run.json").write_text(run)
             with pytest.raises(InputError, match="holds files that are not a result of mvseg infer"):
