@@ -421,17 +421,6 @@ def test_a_broken_scene_does_not_stop_the_others(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plant"]
 
 
-def test_links_name_their_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for plant in ("basil", "mint"):
-        write_scene(tmp_path / plant / "D00")
-        (tmp_path / f"{plant}-0").symlink_to(tmp_path / plant / "D00")
-    links = [str(tmp_path / "basil-0"), str(tmp_path / "mint-0")]
-    assert main(["match", *links, "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["basil-0", "mint-0"]
-    assert json.loads((tmp_path / "out" / "mint-0" / "run.json").read_text())["scene"] == "mint-0"
-    capsys.readouterr()
-
-
 def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(plant, tmp_path / "more" / "plant")
     assert main(["match", str(plant), str(tmp_path / "more" / "plant"), "--out", str(tmp_path / "out")]) == 2
@@ -857,13 +846,6 @@ def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureF
     assert complaint(capsys) == f"{tmp_path / 'file'}: File exists"
     assert main(["infer", str(tmp_path / "file"), "--out", str(tmp_path / "out")]) == 2
     assert "is a file, expected the scene's folder" in complaint(capsys)
-
-
-def test_simulate_keeps_out_of_folders_with_other_things(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = sorted(plant.rglob("*"))
-    assert main(["simulate", "paper-eval", "--out", str(plant)]) == 2
-    assert "holds files that are not a data set" in complaint(capsys)
-    assert sorted(plant.rglob("*")) == before
 
 
 def test_simulate_says_what_it_needs(
