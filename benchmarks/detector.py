@@ -30,21 +30,20 @@ import cv2
 import numpy as np
 import torch
 import trimesh
+from pycocotools import mask as coco_mask
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.best_dice import count_and_dice
+from benchmarks.choice import true_maps
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
-from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
+from mvseg.evaluation.average_precision import Annotations, annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
-from mvseg.formats.label_png import read_label_png
-from mvseg.formats.lens import undistort
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
@@ -70,6 +69,51 @@ def list_photos(folders: list[Path]) -> SampleList:
     """The photos of all scenes with their true labels."""
     lists = [list_samples(folder / "images", folder / "truth") for folder in folders]
     return SampleList(tuple(sample for of_scene in lists for sample in of_scene.samples), ("leaf",))
+
+
+def count_and_dice(
+    truth: Annotations, detections: Annotations, num_images: int, *, min_score: float
+) -> dict[str, float]:
+    """Symmetric best Dice and the difference in count, as the CVPPP leaf segmentation challenge judges photos.
+
+    Scharr et al., "Leaf segmentation in plant phenotyping: a collation study", Machine Vision and Applications 2016.
+
+    Means over the photos. Categories are not told apart, and ignored areas (crowds) are left out of the truth.
+
+    Args:
+        truth: annotations of the true instances, see `annotate_truth`.
+        detections: annotations with "score", see `annotate_detections`; their masks may overlap.
+        num_images: image ids are 0..num_images - 1.
+        min_score: detections that score less do not count.
+
+    Returns:
+        "sbd": the smaller of the mean best Dice of the true masks among the detections and the reverse, in [0, 1]; 1
+        for a photo without leaves and detections, 0 for one with only either. "count_difference": detections minus
+        leaves. "absolute_count_difference": its absolute value, photo by photo.
+
+    Raises:
+        ValueError: no images.
+    """
+    if num_images < 1:
+        raise ValueError("no images, expected at least one")
+    dice, difference = np.zeros(num_images), np.zeros(num_images)
+    for image in range(num_images):
+        true = [each["segmentation"] for each in truth if each["image_id"] == image and not each["iscrowd"]]
+        found = [
+            each["segmentation"] for each in detections if each["image_id"] == image and each["score"] >= min_score
+        ]
+        difference[image] = len(found) - len(true)
+        if not true or not found:
+            dice[image] = float(not true and not found)
+            continue
+        iou = coco_mask.iou(found, true, [0] * len(true))
+        dices = 2 * iou / (1 + iou)
+        dice[image] = min(dices.max(0).mean(), dices.max(1).mean())
+    return {
+        "sbd": float(dice.mean()),
+        "count_difference": float(difference.mean()),
+        "absolute_count_difference": float(np.abs(difference).mean()),
+    }
 
 
 def visible_share(folder: Path, cameras: Cameras, truth: Regions) -> np.ndarray:
@@ -121,11 +165,8 @@ def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
 
 def read_truth(folder: Path, scene: Scene) -> SceneTruth:
     regions = load_masks(scene, folder / "truth")
-    maps = []
-    for view, (width, height), K in zip(scene.views, scene.cameras.sizes.tolist(), scene.cameras.K, strict=True):
-        labels = read_label_png(folder / "truth" / f"{view.name}.png", width, height)
-        maps.append(undistort(labels, view.lens, K.numpy()))
-    return SceneTruth(regions, maps, torch.from_numpy(visible_share(folder, scene.cameras, regions) < HIDDEN))
+    is_hidden = torch.from_numpy(visible_share(folder, scene.cameras, regions) < HIDDEN)
+    return SceneTruth(regions, true_maps(folder, scene), is_hidden)
 
 
 def count_found(masks: Masks, truth: SceneTruth) -> dict[str, float]:

@@ -40,6 +40,7 @@ import mvseg.matching.numbers
 import mvseg.reconstruction.numbers
 import mvseg.tracking.numbers
 import mvseg.verification.numbers
+from benchmarks.choice import true_maps
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
@@ -52,7 +53,6 @@ from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
-from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
@@ -214,9 +214,7 @@ DRAWING = (DRAWN, COLORS)
 def check_given(args: argparse.Namespace) -> Iterator[Trial]:
     for folder in args.given:
         scene = load_scene(folder)
-        sizes = zip(scene.views, scene.cameras.sizes.tolist(), strict=True)
-        truth = [read_label_png(folder / "truth" / f"{view.name}.png", *size) for view, size in sizes]
-        yield check_trial(folder.name, load_masks(scene, folder / "masks"), scene.cameras, truth)
+        yield check_trial(folder.name, load_masks(scene, folder / "masks"), scene.cameras, true_maps(folder, scene))
 
 
 def check_simulated(args: argparse.Namespace) -> Iterator[Trial]:

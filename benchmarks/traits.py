@@ -32,9 +32,9 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.choice import true_maps
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, load_photos
 from benchmarks.paper_tables.masks import find_masks
-from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_scene
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -140,11 +140,7 @@ def leave_one_out(folder: Path) -> None:
     """IoU of surfaces with the masks of a view that they were not fitted to."""
     torch.set_num_threads(1)
     scene = load_scene(folder)
-    sizes = scene.cameras.sizes.tolist()
-    maps = [
-        read_label_png(folder / "truth" / f"{view.name}.png", *size)
-        for view, size in zip(scene.views, sizes, strict=True)
-    ]
+    maps = true_maps(folder, scene)
     regions = regions_from_label_maps(maps)
     records = []
     for view, labels in enumerate(maps):

@@ -14,14 +14,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.camera_faults import rotate_cameras
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
-from mvseg.scene import Cameras, Scene, View
+from mvseg.scene import Scene, View
 from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
@@ -74,15 +74,6 @@ def sway(plant: Plant, rng: np.random.Generator) -> Plant:
     return replace(plant, leaves=tuple(moved))
 
 
-def shake_poses(cameras: Cameras, rng: np.random.Generator) -> Cameras:
-    """The cameras, each turned so that the image moves by about `POSE_PX` pixels."""
-    angles = rng.normal(0, POSE_PX, (len(cameras), 3)) / cameras.K[:, :1, 0].numpy()
-    turned = Rotation.from_rotvec(angles).as_matrix()
-    return replace(
-        cameras, R=torch.from_numpy(turned) @ cameras.R, t=(torch.from_numpy(turned) @ cameras.t[..., None])[..., 0]
-    )
-
-
 def write_unruly(
     folder: Path,
     family: str,
@@ -118,7 +109,7 @@ def write_unruly(
         write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))
     files = [f"images/{name}.jpg" for name in names]
     views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
-    stated = shake_poses(cameras, rng)
+    stated = rotate_cameras(cameras, POSE_PX, rng)
     scene = Scene(name=folder.name, views=views, cameras=stated, unit=plant.unit, up=(0.0, 0.0, 1.0))
     write_rig(folder / "cameras.json", scene, files)
 

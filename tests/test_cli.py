@@ -9,7 +9,6 @@ import os
 import re
 import runpy
 import shutil
-import struct
 import subprocess
 import sys
 import warnings
@@ -33,10 +32,10 @@ from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
+from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
 # for tests that look at no shape and at no page
 COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--report", "false"]
 SMALL = ["--detect.image_size", "128"]  # for those that look at no detection: one size, and as large as the photos are
@@ -333,24 +332,44 @@ def test_without_words_there_is_help(capsys: pytest.CaptureFixture[str]) -> None
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("words", "config", "message"),
     [
-        ("infr plant", "there is no verb 'infr', did you mean infer?"),
-        ("--verson", "unrecognized arguments: --verson: did you mean --version?"),
-        ("eval", "eval needs result, truth: mvseg eval --help says more"),
-        ("quux", f"there is no verb 'quux', expected one of {', '.join(VERBS)}"),
-        ("infer . --num_pionts 3", "unrecognized arguments: --num_pionts 3: did you mean --match.num_points?"),
-        ("correct . --no_brower", "unrecognized arguments: --no_brower: did you mean --no_browser?"),
-        ("infer . --config run.yaml", "Subcommand 'infer' does not accept option 'scael': did you mean --scale?"),
+        ("infr plant", "", "there is no verb 'infr', did you mean infer?"),
+        ("--verson", "", "unrecognized arguments: --verson: did you mean --version?"),
+        ("eval", "", "eval needs result, truth: mvseg eval --help says more"),
+        ("eval results", "", "eval needs truth: mvseg eval --help says more"),
+        ("quux", "", f"there is no verb 'quux', expected one of {', '.join(VERBS)}"),
+        ("infer . --num_pionts 3", "", "unrecognized arguments: --num_pionts 3: did you mean --match.num_points?"),
+        ("correct . --no_brower", "", "unrecognized arguments: --no_brower: did you mean --no_browser?"),
+        ("infer . --config run.yaml", "scael: 2", "does not accept option 'scael': did you mean --scale?"),
+        ("infer . --config run.yaml", "match: {num_pionts: 3}", "match.num_pionts"),
+        ("infer . --config run.yaml", "match: {num_points: [3", "run.yaml: is not a YAML file"),
+        ("infer . --config run.yaml", 'out: "a\\0b"', "out is 'a\\x00b', expected text without null characters"),
+        ("infer . --config run.yaml", "scale: -1", "scale is -1, expected a positive number"),
+        ("infer . --config absent.yaml", "", "absent.yaml"),
+        ("infer . surplus", "", "surplus"),
+        ("infer . --match.num_points many", "", "--match.num_points is many, expected a whole number or null"),
+        ("infer . --match.num_points 0", "", "--match.num_points is 0"),
+        ("infer . --match.search_range [5,3]", "", "match.search_range is"),
+        ("infer . --split_merged=maybe", "", "--split_merged is maybe, expected true or false"),
+        ("infer . --reconstruct.shape ball", "", "--reconstruct.shape is ball, expected surface, voxels, both"),
+        ("infer . --detect.min_score 3", "", "--detect.min_score is 3, expected a number from 0 to 1"),
     ],
 )
-def test_what_was_probably_meant(
-    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_wrong_words_are_named_as_they_were_typed(
+    words: str,
+    config: str,
+    message: str,
+    plant: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("run.yaml").write_text("scael: 2\n")
+    monkeypatch.chdir(plant)
+    Path("run.yaml").write_text(config)
+    before = sorted(plant.iterdir())
     assert main(words.split()) == 2
-    assert complaint(capsys) == message
+    assert message in complaint(capsys)
+    assert sorted(plant.iterdir()) == before
 
 
 @pytest.mark.parametrize("verb", ["", *VERBS])
@@ -363,25 +382,6 @@ def test_help_fits_a_screen(verb: str, capsys: pytest.CaptureFixture[str], monke
     assert "<class" not in shown
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--match.num_points", "many"], "--match.num_points is many, expected a whole number or null"),
-        (["--split_merged=maybe"], "--split_merged is maybe, expected true or false"),
-        (["--reconstruct.shape", "ball"], "--reconstruct.shape is ball, expected surface, voxels, both"),
-        (["--detect.min_score", "3"], "--detect.min_score is 3, expected a number from 0 to 1"),
-        (["--config", "run.yaml"], "scale is -1, expected a positive number"),  # it stands so in the file
-    ],
-)
-def test_options_are_named_as_they_were_typed(
-    words: list[str], message: str, plant: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(plant)
-    Path("run.yaml").write_text("scale: -1\n")
-    assert main(["infer", ".", *words]) == 2
-    assert complaint(capsys) == message
-
-
 @pytest.mark.parametrize(("script", "option"), [("infer.py", "--masks"), ("train.py", "--photos")])
 def test_scripts_of_the_checkout_are_verbs(
     script: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -391,45 +391,6 @@ def test_scripts_of_the_checkout_are_verbs(
         runpy.run_path(str(ROOT / script), run_name="__main__")
     assert stop.value.code == 0
     assert option in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("config", "arguments", "message"),
-    [
-        ("match: {num_pionts: 3}", [], "match.num_pionts"),
-        ("colour: red", [], "colour"),
-        ("reconstruct: {threshold: high}", [], "reconstruct.threshold"),
-        ("match: {num_points: [3", [], "run.yaml: is not a YAML file"),
-        ("", ["--match.num_pionts", "3"], "--match.num_pionts"),
-        ("", ["--match.num_points", "many"], "match.num_points"),
-        ("", ["--config", "absent.yaml"], "absent.yaml"),
-        ('out: "a\\0b"', [], "out is 'a\\x00b', expected text without null characters"),
-        ("", ["surplus"], "surplus"),
-    ],
-)
-def test_wrong_options(
-    config: str,
-    arguments: list[str],
-    message: str,
-    plant: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    (tmp_path / "run.yaml").write_text(config)
-    first = ["--config", str(tmp_path / "run.yaml")] if config else []
-    common = [str(plant), "--masks", "masks", "--out", str(tmp_path / "out")]
-    assert main(["infer", *common, *first, *arguments]) == 2
-    assert message in complaint(capsys)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("command", "missing"),
-    [("guess", "'guess'"), ("match", "scenes"), ("eval", "result"), ("eval results", "truth")],
-)
-def test_incomplete_commands(command: str, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(command.split()) == 2
-    assert missing in complaint(capsys)
 
 
 # --- Several scenes -------------------------------------------------------------------------------
@@ -458,17 +419,6 @@ def test_a_broken_scene_does_not_stop_the_others(
     assert captured.err == f"mvseg: error: {broken}/masks/001.png: the mask file is missing (view 1)\n"
     assert captured.out.startswith(f"{tmp_path}/out/plant: 3 instances")
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plant"]
-
-
-def test_links_name_their_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for plant in ("basil", "mint"):
-        write_scene(tmp_path / plant / "D00")
-        (tmp_path / f"{plant}-0").symlink_to(tmp_path / plant / "D00")
-    links = [str(tmp_path / "basil-0"), str(tmp_path / "mint-0")]
-    assert main(["match", *links, "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["basil-0", "mint-0"]
-    assert json.loads((tmp_path / "out" / "mint-0" / "run.json").read_text())["scene"] == "mint-0"
-    capsys.readouterr()
 
 
 def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -539,27 +489,8 @@ def remove(name: str) -> Break:
     return lambda folder: (folder / name).unlink()
 
 
-def write_text(name: str, text: str) -> Break:
-    return lambda folder: (folder / name).write_text(text) and None
-
-
 def cut(name: str, share: float) -> Break:
     return lambda folder: cut_file(folder / name, share)
-
-
-def picture(name: str, *shape: int, dtype: type = np.uint8) -> Break:
-    return lambda folder: write_image(folder / name, np.zeros(shape, dtype))
-
-
-def noise(kind: str) -> Break:
-    """Mask 1 as a photo, which is PNG or JPEG whatever its name says."""
-
-    def change(folder: Path) -> None:
-        pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-        write_image(folder / f"noise.{kind}", pixels)
-        (folder / f"noise.{kind}").rename(folder / "masks" / "001.png")
-
-    return change
 
 
 def as_jpeg(share: float) -> Break:
@@ -574,8 +505,8 @@ def as_jpeg(share: float) -> Break:
     return change
 
 
-def colmap(name: str = "", length: float = 1.0, *, replace: tuple[bytes, bytes] | None = None) -> Break:
-    """The cameras as a binary COLMAP model, one of its files cut or changed."""
+def colmap(name: str = "", length: float = 1.0) -> Break:
+    """The cameras as a binary COLMAP model, one of its files cut."""
 
     def change(folder: Path) -> None:
         model = pycolmap.Reconstruction()
@@ -591,95 +522,28 @@ def colmap(name: str = "", length: float = 1.0, *, replace: tuple[bytes, bytes] 
         (folder / "cameras.json").unlink()
         if name:
             cut_file(folder / "sparse" / name, length)
-        if replace:
-            path = folder / "sparse" / "cameras.bin"
-            path.write_bytes(path.read_bytes().replace(*replace))
-
-    return change
-
-
-def transforms(**changes: Any) -> Break:
-    def change(folder: Path) -> None:
-        (folder / "cameras.json").unlink()
-        moved = [np.eye(4) + v * np.outer((1, 0, 0, 0), (0, 0, 0, 1)) for v in range(4)]
-        frames = [{"file_path": f"images/{v:03d}.png", "transform_matrix": moved[v].tolist()} for v in range(4)]
-        content = {"w": WIDTH, "h": HEIGHT, "fl_x": 150, "cx": 64, "cy": 48, "frames": frames}
-        (folder / "transforms.json").write_text(json.dumps(content | changes))
 
     return change
 
 
 def coco(text: str) -> Break:
     """Masks as a COCO file; the test passes `--masks masks.json`."""
-    return write_text("masks.json", text)
+    return lambda folder: (folder / "masks.json").write_text(text)
 
 
 IMAGES = [{"id": v, "file_name": f"{v:03d}.png", "width": WIDTH, "height": HEIGHT} for v in range(4)]
 BAD_RLE = {"id": 7, "image_id": 2, "segmentation": {"size": [HEIGHT, WIDTH], "counts": "zz"}}
+# What is read late, or by a library that writes to stderr itself; all other faults are tested where files are read.
 BAD_INPUT: dict[str, tuple[Break, str]] = {
     "missing image": (remove("images/002.png"), "images/002.png: the image of view 2 is missing"),
-    "image of another size": (picture("images/002.png", 96, 127, 3), "images/002.png: the image of view 2 is 127 x 96"),
-    "image cut": (cut("images/002.png", 0.7), "images/002.png: the image of view 2 cannot be read"),
-    "image empty": (cut("images/002.png", 0), "images/002.png: the image of view 2 cannot be read"),
     "JPEG cut": (as_jpeg(0.6), "images/002.jpg: the image of view 2 cannot be read"),
-    "JPEG cut at its end": (as_jpeg(0.999), "images/002.jpg: the image of view 2 cannot be read"),
-    "image is text": (write_text("images/002.png", "hello"), "images/002.png: the image of view 2 cannot be read"),
-    "camera model in transforms.json": (
-        transforms(camera_model="CUBIST"),
-        "transforms.json: frame 0 (images/000.png): the camera model 'CUBIST' is not known",
-    ),
-    "camera model in COLMAP": (
-        colmap(replace=(struct.pack("<ii", 1, 1), struct.pack("<ii", 1, 77))),
-        "sparse/cameras.bin: camera model number 77 is not known",
-    ),
-    "no rotation": (rig(1, R=np.diag([1, 1, 1.2]).tolist()), "view 1 (images/001.png): R is not a rotation"),
-    "reflection": (rig(1, R=np.diag([1, 1, -1]).tolist()), "view 1 (images/001.png): R is a reflection"),
-    "zero focal length": (
-        rig(3, K=[[0, 0, 64], [0, 150, 48], [0, 0, 1]]),
-        "view 3 (images/003.png): the focal length is 0",
-    ),
-    "zero focal length in COLMAP": (
-        colmap(replace=(struct.pack("<2d", 150, 150), struct.pack("<2d", 0, 150))),
-        "sparse: view 0 (images/000.png): the focal length is 0",
-    ),
     "NaN in a pose": (rig(1, t=[0, NAN, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
-    "infinity in a pose": (rig(1, t=[0, INF, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
-    "two views of one name": (rig(3, file="images/001.jpg"), "cameras.json: views 1 and 3 have the same name '001'"),
-    "name that leads out": (rig(2, file="../a.png"), "view 2 (../a.png): the file name leads out of the scene"),
-    "absolute name": (rig(2, file="/etc/passwd"), "view 2 (/etc/passwd): the file name leads out of the scene"),
-    "name of a folder": (rig(2, file="images/.."), "view 2 (images/..): this is not the name of a file"),
-    "missing mask": (remove("masks/001.png"), "masks/001.png: the mask file is missing (view 1)"),
-    "mask of another size": (picture("masks/001.png", 95, 128), "masks/001.png: the mask is 128 x 95, its camera says"),
-    "mask is a photo": (noise("png"), "masks/001.png: holds 12"),
-    "mask is a JPEG": (noise("jpg"), "masks/001.png: is a JPEG, which blurs the numbers"),
     "mask cut": (cut("masks/001.png", 0.6), "masks/001.png: cannot be read, expected a whole label PNG: it is"),
-    "mask empty": (cut("masks/001.png", 0), "masks/001.png: cannot be read, expected a whole label PNG: it is"),
-    "COCO cut": (coco(json.dumps({"images": IMAGES, "annotations": []})[:50]), "masks.json: not a whole JSON file"),
-    "COCO of other photos": (
-        coco(json.dumps({"images": [image | {"file_name": f"x{image['id']}"} for image in IMAGES], "annotations": []})),
-        "none of its images is a photo of the scene, expected 000.png, 001.png, 002.png and 1 more, found x0, x1, x2",
-    ),
-    "COCO of another size": (
-        coco(json.dumps({"images": [IMAGES[0] | {"width": 5}, *IMAGES[1:]], "annotations": []})),
-        "masks.json: image 000.png is 5 x 96",
-    ),
     "COCO mask broken": (
         coco(json.dumps({"images": IMAGES, "annotations": [BAD_RLE]})),
         "masks.json: annotation 7: its run lengths do not add up",
     ),
-    "COCO of another form": (coco("[1, 2]"), "masks.json: [0]: Input should be a valid dictionary"),
-    "single view": (rig(views=rig_content()["views"][:1]), "cameras.json: there is a single view"),
-    "rig without views": (rig(views=[]), "cameras.json: there are no views"),
-    "rig of another format": (rig(format="mvseg-rig/9"), "cameras.json: format: Input should be 'mvseg-rig/1'"),
-    "rig cut": (cut("cameras.json", 0.5), "cameras.json: not a whole JSON file"),
-    "rig empty": (cut("cameras.json", 0), "cameras.json: not a whole JSON file"),
-    "transforms.json without frames": (transforms(frames=[]), "transforms.json: there are no views"),
-    "no cameras": (remove("cameras.json"), "plant: no cameras, expected cameras.json"),
-    **{
-        f"{name} cut at {share}": (colmap(name, share), f"sparse/{name}: not a whole COLMAP file")
-        for name in ("cameras.bin", "images.bin", "points3D.bin")
-        for share in (0.2,)
-    },
+    "images.bin cut": (colmap("images.bin", 0.2), "sparse/images.bin: not a whole COLMAP file"),
 }
 
 
@@ -702,8 +566,6 @@ def test_the_same_scene_whole_is_fine(plant: Path, tmp_path: Path) -> None:
     coco(json.dumps({"images": IMAGES, "annotations": []}))(plant)
     for scene, masks in ((plant, "masks"), (tmp_path / "colmap", "masks"), (plant, "masks.json")):
         load_masks(load_scene(scene), scene / masks)
-    transforms()(plant)
-    load_scene(plant)
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "full"])
@@ -715,7 +577,7 @@ def test_output_that_cannot_be_written(
     (tmp_path / "full" / "thesis.tex").touch()
     before = sorted(tmp_path.rglob("*"))
     assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / place), "--quiet"]) == 2
-    reason = "holds files that are not an earlier result" if place == "full" else "the output folder is not writable"
+    reason = "holds files that are not a result" if place == "full" else "the output folder is not writable"
     assert f"{tmp_path / place}: {reason}" in complaint(capsys)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -743,7 +605,7 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
 @pytest.mark.slow
 def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
     """Libraries that write to stderr by themselves would show here: one sentence per broken scene, and nothing else."""
-    names = ["JPEG cut", "images.bin cut at 0.2", "mask cut"]
+    names = ["JPEG cut", "images.bin cut", "mask cut"]
     for number, name in enumerate(names):
         BAD_INPUT[name][0](write_scene(tmp_path / f"plant_{number}"))
     scenes = [f"plant_{number}" for number in range(len(names))]
@@ -773,18 +635,6 @@ def test_masks_are_looked_for_in_two_places(
     assert main(["match", str(plant), "--masks", str(tmp_path / "annotations"), "--out", "two", "--quiet"]) == 0
 
 
-@pytest.mark.parametrize("option", ["num_points=0", "num_points=-5", "num_restarts=0", "seed=-1", "search_range=[5,3]"])
-def test_options_out_of_range(plant: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
-    name, value = option.split("=")
-    arguments = ["match", str(plant), "--out", str(tmp_path / "out"), "--quiet", f"--match.{name}", value]
-    assert main(arguments) == 2
-    error = capsys.readouterr().err
-    assert error.startswith("mvseg: error: ")
-    assert error.count("\n") == 1
-    assert f"match.{name} is" in error
-    assert not (tmp_path / "out").exists()
-
-
 # --- What the user is told ------------------------------------------------------------------------
 
 
@@ -810,8 +660,8 @@ def test_another_scenes_result_is_replaced_only_when_asked_for(
     before = (place / "run.json").read_bytes()
     capsys.readouterr()
     assert main([*command, str(other)]) == 2
-    message = f"{place}: holds the result of another scene, {plant}, not of {other}"
-    assert complaint(capsys) == f"{message}; expected another --out, or --overwrite true"
+    message = f"{place}: holds a result of mvseg infer, match or batch, made of {plant}, not of {other}"
+    assert complaint(capsys) == f"{message}; expected another folder, or --overwrite true"
     assert (place / "run.json").read_bytes() == before
     (tmp_path / "link").symlink_to(plant)
     if verb == "infer":
@@ -996,13 +846,6 @@ def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureF
     assert complaint(capsys) == f"{tmp_path / 'file'}: File exists"
     assert main(["infer", str(tmp_path / "file"), "--out", str(tmp_path / "out")]) == 2
     assert "is a file, expected the scene's folder" in complaint(capsys)
-
-
-def test_simulate_keeps_out_of_folders_with_other_things(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = sorted(plant.rglob("*"))
-    assert main(["simulate", "paper-eval", "--out", str(plant)]) == 2
-    assert "holds files that are not a data set" in complaint(capsys)
-    assert sorted(plant.rglob("*")) == before
 
 
 def test_simulate_says_what_it_needs(

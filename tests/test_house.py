@@ -24,8 +24,6 @@ import yaml
 import mvseg
 import mvseg.matching
 from benchmarks.demo_plant import write_demo_plant, write_demo_plant_later
-from benchmarks.paper_tables.experiments import Plan
-from benchmarks.paper_tables.write_up import unpack_records, write_page
 from mvseg._version import code_hash, made_by
 from mvseg.cli import command
 from mvseg.training.config import TrainConfig
@@ -119,7 +117,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 39_400, "benchmarks": 8_000, "tests": 35_800}
+BUDGET = {"mvseg": 39_200, "benchmarks": 6_800, "tests": 35_300}
 SLACK = 400
 
 
@@ -338,12 +336,6 @@ def test_every_format_names_a_test() -> None:
     rows = [row for table in tables if "tested with" in table for row in table.strip().splitlines()[2:]]
     assert len(rows) > 15
     assert [row for row in rows if not re.search(r"\((`tests/[\w/]+\.py`(, )?)+\) \|$", row)] == []
-
-
-def test_the_benchmarks_page_is_what_its_records_and_texts_give(tmp_path: Path) -> None:
-    plots = {path.stem: path.name for path in (ROOT / "docs").glob("benchmarks-*.png")}
-    plan = unpack_records(ROOT / "docs" / "benchmarks.json", Plan("paper", tmp_path, detector="leaf-slim"))
-    assert write_page(plan, plots) == (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.slow

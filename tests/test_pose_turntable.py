@@ -133,19 +133,6 @@ def test_two_cameras_and_other_angles(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "other/0.png is in no folder of a camera, expected folders of these names" in capsys.readouterr().err
 
 
-def write_disturbed(path: Path, scene: Path, *, degrees: float = 0.3) -> list[float]:
-    """The turntable file of a scene with a camera that is tilted against the axis, and angles that are a bit off."""
-    content = json.loads((scene / "turntable.json").read_text())
-    turn = Rotation.from_rotvec([np.radians(degrees), 0, 0]).as_matrix()
-    camera = content["cameras"]["camera"]
-    camera["R"] = (np.array(camera["R"]) @ turn).tolist()
-    angles = [view["angle"] for view in content["views"]]
-    for index, view in enumerate(content["views"]):
-        view["angle"] += degrees * (-1) ** index
-    path.write_text(json.dumps(content))
-    return angles
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -1,6 +1,6 @@
 """Dense points of a scene by multi-view stereo, for the comparisons of Sec. 4.2 and 4.3.
 
-From one of three backends: semi-global matching (any CPU), COLMAP's PatchMatch (CUDA), or a file made elsewhere.
+By semi-global matching, on any CPU; the paper's PatchMatch needs a graphics card.
 """
 
 from __future__ import annotations
@@ -8,13 +8,11 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 import pycolmap
 import torch
-import trimesh
 from torch import Tensor
 
 from benchmarks.baselines.stereo import Ball, seen_ball, sgbm_depths, view_angles
@@ -34,7 +32,7 @@ class DensePoints:
 
     Attributes:
         positions: (P, 3) float64, world frame of the scene's cameras; none when stereo found nothing.
-        backend: what made them: "sgbm", "patchmatch" or "file". Results of different backends must not be mixed.
+        backend: what made them. Results of different backends must not be mixed.
     """
 
     positions: Tensor
@@ -44,50 +42,6 @@ class DensePoints:
         if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not torch.isfinite(self.positions).all():
             raise InputError(f"points have shape {tuple(self.positions.shape)}, expected finite numbers, (P, 3)")
         object.__setattr__(self, "positions", self.positions.double())
-
-
-def read_dense_points(path: Path | str) -> DensePoints:
-    """Points that were made elsewhere, in the world frame of the scene's cameras; backend "file".
-
-    Args:
-        path: a PLY file, or a dense workspace of COLMAP: its fused.ply, or if there is none its depth and normal maps
-            in stereo/, which are fused here (no graphics card needed).
-
-    Raises:
-        InputError: there is no such file, or it cannot be read.
-    """
-    path = Path(path)
-    if path.is_dir() and not (path / "fused.ply").is_file():
-        if not (path / "stereo" / "depth_maps").is_dir():
-            raise InputError(f"{path}: no fused.ply and no stereo/depth_maps, expected a dense workspace of COLMAP")
-        return DensePoints(fuse(path, pycolmap.StereoFusionOptions()), "file")
-    file = path / "fused.ply" if path.is_dir() else path
-    if not file.is_file():
-        raise InputError(f"{file}: the file of dense points is missing")
-    try:
-        geometry: Any = trimesh.load(file, file_type="ply", process=False)  # a mesh, or a cloud without faces
-        vertices = np.array(geometry.vertices, np.float64)
-    except (ValueError, KeyError, IndexError, AttributeError, TypeError) as error:
-        raise InputError(f"{file}: cannot be read as a PLY file of points ({' '.join(str(error).split())})") from None
-    return DensePoints(torch.from_numpy(vertices).reshape(-1, 3), "file")
-
-
-def patch_match_points(scene: Scene) -> DensePoints:
-    """Points of COLMAP's PatchMatch stereo and fusion with default settings, as in the paper; backend "patchmatch".
-
-    Raises:
-        InputError: this pycolmap was built without CUDA, or a photo is missing or broken.
-    """
-    if not pycolmap.has_cuda:
-        raise InputError("PatchMatch stereo needs a pycolmap with CUDA, such as pycolmap-cuda12; this one has none")
-    photos, cameras = read_small_photos(scene)
-    with tempfile.TemporaryDirectory(prefix="mvseg-") as folder:
-        workspace = Workspace(Path(folder), cameras)
-        workspace.write(photos)
-        options = pycolmap.PatchMatchOptions()
-        options.depth_min, options.depth_max = workspace.depth_range
-        pycolmap.patch_match_stereo(folder, options=options)
-        return DensePoints(workspace.to_world(fuse(Path(folder), pycolmap.StereoFusionOptions())), "patchmatch")
 
 
 def sgbm_points(scene: Scene) -> DensePoints:
@@ -158,13 +112,6 @@ class Workspace:
         """One unit of the workspace in world units of the scene."""
         return float(torch.linalg.vector_norm(self.cameras.centers - self.ball.center, dim=1).mean())
 
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest depth of the ball that the cameras see, in the workspace's unit."""
-        distance = torch.linalg.vector_norm(self.cameras.centers - self.ball.center, dim=1)
-        near, far = float(distance.min()) - self.ball.radius, float(distance.max()) + self.ball.radius
-        return max(near, 0.2 * float(distance.min())) / self.unit, far / self.unit
-
     def to_world(self, points: Tensor) -> Tensor:
         """(P, 3) points of the workspace in the scene's world."""
         return points * self.unit + self.ball.center
@@ -185,8 +132,6 @@ class Workspace:
         num_sources = min(NUM_SOURCES, len(photos) - 1)
         sources = view_angles(self.cameras, self.ball).argsort(dim=1, stable=True)[:, :num_sources].tolist()
         names = [self.image_name(view) for view in range(len(photos))]
-        lines = [f"{name}\n{', '.join(names[j] for j in near)}\n" for name, near in zip(names, sources, strict=True)]
-        (self.folder / "stereo" / "patch-match.cfg").write_text("".join(lines))
         (self.folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in names))
         self.model(sources).write(self.folder / "sparse")
 

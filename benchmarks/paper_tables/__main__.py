@@ -1,9 +1,8 @@
-"""`python -m benchmarks.paper_tables [--preset small|paper] [--cache DIR] ...`: run what is missing, write it up.
+"""`python -m benchmarks.paper_tables [--preset small|paper] [--cache DIR] ...`: run what is missing, print the tables.
 
 The paper's tables 1 to 3 and the question of |k|, on simulated test plants and real scenes. The scenes, and one record
-per scene and method, are kept in the cache folder. After an interruption the same command goes on; with --write_only it
-writes up the records so far. After its texts in this folder were changed, the page in docs/ is written anew from its
-own records: `--preset paper --detector leaf-slim --records docs/benchmarks.json --cache NEW`.
+per scene and method, are kept in the cache folder. After an interruption the same command goes on; with --print_only it
+prints the records so far.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from benchmarks.paper_tables.cells import PRESETS, list_cells
 from benchmarks.paper_tables.experiments import TABLES, Plan, run_real, run_simulated
 from benchmarks.paper_tables.methods import METHODS
 from benchmarks.paper_tables.shapes import SHAPES
-from benchmarks.paper_tables.write_up import unpack_records, write_up
+from benchmarks.paper_tables.tables import print_tables
 from mvseg.system.worker_pool import run_all
 
 
@@ -41,16 +40,12 @@ def main(argv: Sequence[str] | None = None) -> None:
         detector=args.detector,
         real=tuple(args.real),
     )
-    if args.records:
-        plan = unpack_records(args.records, plan)
-    elif not args.write_only:
+    if not args.print_only:
         torch.set_num_threads(1)
         run_scenes(partial(run_simulated, plan=plan), list_cells(PRESETS[plan.preset]), args.num_workers)
         if "2" in plan.tables:
             run_scenes(partial(run_real, plan=plan), plan.real, args.num_workers)
-
-    default = Path("docs") if plan.preset == "paper" else plan.cache / "docs"
-    print(write_up(plan, args.out or default))
+    print_tables(plan)
 
 
 def run_scenes(work: Callable[[Any], None], scenes: Sequence[Any], num_workers: int) -> None:
@@ -75,9 +70,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--num_workers", type=int, default=1, help="scenes at once")
     parser.add_argument("--detector", help="also match the masks of this detector: a shipped one's name, or a file")
     parser.add_argument("--real", "--basil", nargs="+", type=Path, default=[], help="real scene folders for table 2")
-    parser.add_argument("--out", type=Path, help="folder for benchmarks.md and its plots (docs; small: CACHE/docs)")
-    parser.add_argument("--records", type=Path, help="run nothing, write up this benchmarks.json; --cache must be new")
-    parser.add_argument("--write_only", action="store_true", help="run nothing, write up the records so far")
+    parser.add_argument("--print_only", action="store_true", help="run nothing, print the records so far")
     return parser
 
 

@@ -67,7 +67,7 @@ def run_simulated(spec: SceneSpec, plan: Plan) -> None:
     if all(path.is_file() for path in wanted):
         return
     cell = open_cell(spec, PRESETS[plan.preset], plan.cache)
-    masks = remember(partial(make_masks, cell, plan))
+    masks = functools.cache(partial(make_masks, cell, plan))  # each kind is made once
     for path, make in list_records(spec, plan):
         keep_record(path, partial(make, cell, masks))
 
@@ -75,7 +75,7 @@ def run_simulated(spec: SceneSpec, plan: Plan) -> None:
 def run_real(folder: Path, plan: Plan) -> None:
     """Make the missing records of one real scene, matched with its true masks."""
     cell = read_cell(folder, folder.resolve().name, {})
-    masks = remember(partial(make_masks, cell, plan))
+    masks = functools.cache(partial(make_masks, cell, plan))  # each kind is made once
     for method in plan.methods:
         path = real_record(plan, folder, method)
         keep_record(path, partial(score_kind, cell, masks, kind="true", method=method, cache=plan.cache))
@@ -134,18 +134,6 @@ def make_masks(cell: Cell, plan: Plan, kind: str) -> Masks:
         return degraded_masks(cell)
     assert plan.detector is not None
     return detected_masks(cell, plan.detector)
-
-
-def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
-    """The same function, which makes each kind of masks only once."""
-    made: dict[str, Masks] = {}
-
-    def once(kind: str) -> Masks:
-        if kind not in made:
-            made[kind] = make(kind)
-        return made[kind]
-
-    return once
 
 
 @functools.cache

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import torch
 
+from benchmarks.baselines.dense_points import DensePoints, sgbm_points
 from benchmarks.baselines.mvs import match_mvs
 from benchmarks.baselines.points import match_points
 from benchmarks.baselines.sparse import match_sparse
 from benchmarks.paper_tables.cells import Cell, Record
-from benchmarks.paper_tables.dense import dense_points
 from benchmarks.paper_tables.masks import Masks
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -33,6 +34,17 @@ PRINTED = {
     "MVIS (one-per-view)": "MVIS",
     "MVIS (nview)": "MVIS",
 }
+
+
+def dense_points(cell: Cell, cache: Path) -> DensePoints:
+    """The points of semi-global matching (the paper's PatchMatch needs a graphics card), cached beside the records."""
+    origin = cell.folder.parents[1].name if cell.axes else "real"  # simulated scenes differ by size and seed
+    path = cache / "points" / origin / f"{cell.name}.npy"
+    if not path.is_file():
+        positions = sgbm_points(cell.scene).positions.numpy()
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, positions)
+    return DensePoints(torch.from_numpy(np.load(path)), "sgbm")
 
 
 def mvs_matching(regions: Regions, cell: Cell, cache: Path) -> Matching:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -103,11 +102,3 @@ def unite(shares: Iterable[tuple[Tensor, Tensor]], size: float) -> tuple[Points,
     best = np.zeros(len(keys))
     np.maximum.at(best, voxel, np.concatenate([share.double().numpy() for _, share in parts]))
     return (np.stack(np.unravel_index(keys, shape), 1) + low + 0.5) * size, best
-
-
-def measure_voxelised_truth(cell: Cell, per_leaf: int) -> Record:
-    """d of the voxels that hold true points: the error of the voxel size alone."""
-    truth = true_leaves(cell)
-    size = truth.mean_length / per_leaf
-    centers = torch.from_numpy((np.floor(truth.points / size) + 0.5) * size)
-    return measure_points(unite([(centers, torch.ones(len(centers)))], size)[0], truth)

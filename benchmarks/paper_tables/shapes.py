@@ -14,12 +14,11 @@ from torch import Tensor
 
 from benchmarks.baselines.semantic import reconstruct_semantic
 from benchmarks.paper_tables.cells import Cell, Record
-from benchmarks.paper_tables.dense import dense_points
 from benchmarks.paper_tables.masks import Masks
+from benchmarks.paper_tables.methods import dense_points
 from benchmarks.paper_tables.shape_error import (
     measure_points,
     measure_shares,
-    measure_voxelised_truth,
     true_leaves,
     unite,
 )
@@ -55,17 +54,10 @@ def carve(cell: Cell, masks: Masks, members: tuple[int, ...], *, threshold: floa
         return back_project(regions, cell.scene.cameras, config=ReconstructConfig(threshold=threshold, voxel_size=size))
 
 
-def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor, *, per_leaf: int = VOXELS_PER_LEAF) -> Record:
-    """{"0.5": measures, ...}: d of the shapes of all instances, by the share of masks that a voxel needs.
-
-    Args:
-        cell: with true leaf meshes.
-        masks: D masks.
-        ids: (D,) instance ids.
-        per_leaf: voxels along the mean length of a leaf.
-    """
+def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor) -> Record:
+    """{"0.5": measures, ...}: d of the shapes of all instances (D,), by the share of masks that a voxel needs."""
     truth = true_leaves(cell)
-    size = truth.mean_length / per_leaf
+    size = truth.mean_length / VOXELS_PER_LEAF
     instances = [tuple((ids == i).nonzero()[:, 0].tolist()) for i in ids[ids > 0].unique().tolist()]
     grids = [carve(cell, masks, members, threshold=min(THRESHOLDS), size=size) for members in instances]
     shares = [(grid.points, grid.votes[grid.occupied]) for grid in grids if grid is not None]
@@ -156,16 +148,6 @@ def matched_hidden(kind: str) -> Shape:
     return measure
 
 
-def with_true_ids(per_leaf: int = VOXELS_PER_LEAF) -> Shape:
-    """True masks with their true ids, and the paper's rule."""
-
-    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
-        ids = masks("true").true_ids
-        return measure_thresholds(cell, masks("true"), torch.where(ids > 0, ids, -1), per_leaf=per_leaf)
-
-    return measure
-
-
 @lru_cache(maxsize=8)
 def estimate(cell: Cell, masks: Masks, method: Literal["symnmf", "nview"]) -> Tensor:
     """(D,) instance ids."""
@@ -180,11 +162,7 @@ SHAPES: dict[str, Shape] = {
     "MVIS (paper), true masks": matched("true", "symnmf"),
     "MVIS (nview), true masks": matched("true", "nview"),
     "MVIS (nview), true masks, hidden parts": matched_hidden("true"),
-    "true ids": with_true_ids(),
     "MVIS (paper), degraded masks": matched("degraded", "symnmf"),
     "MVIS (nview), degraded masks": matched("degraded", "nview"),
     "MVIS (nview), degraded masks, hidden parts": matched_hidden("degraded"),
-    "true ids, 25 voxels": with_true_ids(25),
-    "true ids, 100 voxels": with_true_ids(100),
-    "voxels of the truth": lambda cell, masks, cache: {"0.5": measure_voxelised_truth(cell, VOXELS_PER_LEAF)},
 }

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
 
 from benchmarks.paper_tables import printed
-from benchmarks.paper_tables.averages import average, average_columns, markdown_table, measure
 from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_record
 from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
 from benchmarks.paper_tables.methods import PRINTED
@@ -16,6 +18,21 @@ from mvseg.simulation.dataset import plant_index
 
 MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3)}
 HALVES = ("d", "excess", "gaps")
+Pick = Callable[[Record], float | None]
+
+
+def print_tables(plan: Plan) -> None:
+    """Print the tables of all records so far, as Markdown."""
+    for kind in plan.kinds:
+        if read_matches(plan, kind):
+            print(f"Table 1, {kind} masks: {count_masks(plan, kind)}\n\n{table_1(plan, kind)}\n")
+    if any(real_record(plan, folder, method).is_file() for folder in plan.real for method in plan.methods):
+        print(f"Table 2, real scenes\n\n{table_2(plan)}\n")
+    if read_shapes(plan):
+        print(f"Table 3, d(I, T) in mean leaf lengths: {table_3(plan)}\n")
+        print(f"Thresholds, and parts that other leaves hide: {table_rules(plan)}\n")
+    if read_records(plan.records / "numbers" / "true", list_cells(PRESETS[plan.preset])):
+        print(f"The number of leaves: {table_numbers(plan)}")
 
 
 def axes(plan: Plan) -> tuple[list[int], list[int]]:
@@ -152,24 +169,6 @@ def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
     return f"{done} of {asked} scenes.{caution}"
 
 
-def table_error(plan: Plan) -> str:
-    """What d consists of, over all scenes: one thing is changed at a time."""
-    wanted = [
-        ("voxels that hold the true points", "voxels of the truth"),
-        ("true masks and ids, 25 voxels per leaf length", "true ids, 25 voxels"),
-        ("true masks and ids, 50 voxels (all other rows)", "true ids"),
-        ("true masks and ids, 100 voxels", "true ids, 100 voxels"),
-        ("true masks, ids of nview", "MVIS (nview), true masks"),
-        ("true masks, ids of the paper's clustering", "MVIS (paper), true masks"),
-        ("degraded masks, ids of nview", "MVIS (nview), degraded masks"),
-        ("degraded masks, ids of the paper's clustering", "MVIS (paper), degraded masks"),
-    ]
-    shapes = read_shapes(plan, [name for _, name in wanted])
-    rows = [[label, *split_cells(shapes[name], "0.5")] for label, name in wanted if name in shapes]
-    table = markdown_table(["changed", *HALVES], rows)
-    return f"{count_scenes(shapes, plan)}\n\n{table}"
-
-
 def table_rules(plan: Plan) -> str:
     """d and its halves, over all scenes, for every threshold of both rules."""
     wanted = [
@@ -210,7 +209,70 @@ def table_numbers(plan: Plan) -> str:
     return f"{len(records['true'])} of {len(specs)} scenes.\n\n{table}"
 
 
-def read_notes(path: Path) -> dict[str, str]:
-    """{heading: text} of a hand-written file of `## heading` sections."""
-    sections = path.read_text(encoding="utf-8").split("\n## ")
-    return {name.strip(): text.strip() for name, _, text in (section.partition("\n") for section in sections[1:])}
+# --- averages
+
+
+@dataclass(frozen=True)
+class Average:
+    """Mean of a measure over cells; a cell is a number of leaves and a number of cameras, and counts once.
+
+    Attributes:
+        value: mean over the cells of the mean over their plants; None when no scene has a value.
+        answered: number of scenes with a value.
+        asked: number of scenes.
+    """
+
+    value: float | None
+    answered: int
+    asked: int
+
+    def text(self, decimals: int) -> str:
+        """The value, with the number of scenes behind it when some have none; "N/A" when all have none; "-" without
+        scenes."""
+        if self.value is None:
+            return "N/A" if self.asked else "-"
+        part = "" if self.answered == self.asked else f" ({self.answered} of {self.asked})"
+        return f"{self.value:.{decimals}f}{part}"
+
+
+def average(records: Iterable[Record], pick: Pick) -> Average:
+    """The average of the values that `pick` takes from the records; None = no value."""
+    cells = defaultdict(list)
+    asked = 0
+    for record in records:
+        asked += 1
+        value = pick(record)
+        if value is not None:
+            cells[record["leaves"], record["views"]].append(value)
+    answered = sum(len(values) for values in cells.values())
+    means = [float(np.mean(values)) for values in cells.values()]
+    return Average(float(np.mean(means)) if means else None, answered, asked)
+
+
+def average_columns(
+    records: Sequence[Record], pick: Pick, *, views: Sequence[int], leaves: Sequence[int], leaves_at: int | None = None
+) -> list[Average]:
+    """One average per number of cameras, then one per number of leaves (with `leaves_at` cameras only), then all."""
+    for_leaves = [record for record in records if leaves_at in (None, record["views"])]
+    columns = [average([r for r in records if r["views"] == number], pick) for number in views]
+    columns += [average([r for r in for_leaves if r["leaves"] == number], pick) for number in leaves]
+    return [*columns, average(records, pick)]
+
+
+def measure(*keys: str) -> Pick:
+    """Picks `record[key][key]...`; None where the record, or the part of it that is asked for, is not applicable."""
+
+    def pick(record: Record) -> float | None:
+        value: Record | float = record
+        for key in keys:
+            if not isinstance(value, dict) or "na" in value:
+                return None
+            value = value[key]
+        return None if isinstance(value, dict) else value
+
+    return pick
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
+    return "\n".join(lines)

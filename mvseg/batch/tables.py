@@ -9,8 +9,9 @@ from typing import Any
 from mvseg.batch.scene_list import SUMMARY_COLUMNS, BatchScene
 from mvseg.batch.status import TABLES, Status
 from mvseg.errors import InputError
+from mvseg.formats.text_file import Cell, write_table
 from mvseg.results.earlier import Output, replace_result
-from mvseg.traits.table import COLUMNS, as_cells, read_csv, wide_columns, write_csv
+from mvseg.traits.table import COLUMNS, read_csv, wide_columns
 
 
 def write_tables(
@@ -26,14 +27,14 @@ def write_tables(
     carried = list(scenes[0][0].carried)
     done = [scene for scene, status in scenes if status.state == "done"]
     summary = [[*_about(scene), *_outcome(status)] for scene, status in scenes]
-    failures = [as_cells(scene.name, str(scene.folder), status.sentence)
+    failures = [(scene.name, str(scene.folder), status.sentence)
                 for scene, status in scenes if status.state == "failed"]  # fmt: skip
     counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
     with replace_result(folder, {**run, "counts": counts}, Output("tables")) as partial:
         for name, columns in (("traits.csv", COLUMNS), ("traits_wide.csv", wide_columns())):
             _join(partial / name, columns, done, out, carried=carried)
-        write_csv(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)
-        write_csv(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
+        write_table(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)
+        write_table(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
 
 
 def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
@@ -48,16 +49,16 @@ def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str,
     return read_csv(path, columns)
 
 
-def _about(scene: BatchScene) -> list[str | int]:
+def _about(scene: BatchScene) -> tuple[Cell, ...]:
     """The first cells of a row: the scene and its cells of the batch's table."""
-    return as_cells(scene.name, *scene.carried.values())
+    return scene.name, *scene.carried.values()
 
 
-def _outcome(status: Status) -> list[str | int]:
+def _outcome(status: Status) -> tuple[Cell, ...]:
     counts = status.instances, status.masks, status.views, len(status.warnings)
     peak = "" if status.peak_mb is None else f"{status.peak_mb:.0f}"
     texts = " | ".join(status.warnings), status.sentence
-    return as_cells(status.state, *counts, f"{status.seconds:.1f}", peak, *texts)
+    return status.state, *counts, f"{status.seconds:.1f}", peak, *texts
 
 
 def _join(
@@ -70,4 +71,4 @@ def _join(
         for scene in scenes
         for row in read_csv(out / scene.name / path.name, columns)
     ]
-    write_csv(path, ["scene", *carried, *kept], rows)
+    write_table(path, ["scene", *carried, *kept], rows)

@@ -15,7 +15,7 @@ import uuid
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mvseg.errors import InputError
 from mvseg.system.sigterm import held_back
-from mvseg.system.worker_pool import one_thread, start_pools
+from mvseg.system.worker_pool import start_pool
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -82,9 +82,9 @@ def run_locally(
     """
     todo = dict(items)
     asked: dict[Future[Any], tuple[int | None, ProcessPoolExecutor]] = {}  # None: whether the worker has started
-    with start_pools() as start_pool:
+    with ExitStack() as stack:
         for _ in range(min(num_workers, len(items))):
-            asked |= _start_worker(start_pool(1), work)
+            asked |= _start_worker(stack.enter_context(start_pool(1)), work)
         while asked:
             for future in wait(asked, return_when=FIRST_COMPLETED).done:
                 key, worker = asked.pop(future)
@@ -95,7 +95,7 @@ def run_locally(
                         raise InputError("no worker can be started: the process dies before it has anything to do")
                     continue  # the others go on
                 if todo and has_died:
-                    asked |= _start_worker(start_pool(1), work)
+                    asked |= _start_worker(stack.enter_context(start_pool(1)), work)
                 elif todo:
                     following = next(iter(todo))
                     started(following)
@@ -110,7 +110,7 @@ def _start_worker(
     worker: ProcessPoolExecutor, work: Callable[[Any], Any]
 ) -> dict[Future[Any], tuple[None, ProcessPoolExecutor]]:
     # it inherits the blocked signals: Ctrl-C is left to the parent
-    with one_thread(), held_back(signal.SIGINT):
+    with held_back(signal.SIGINT):
         return {worker.submit(_load, work): (None, worker)}
 
 

@@ -20,7 +20,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LeftOut
-from mvseg.verification.evidence import Evidence, Ints, Shown, paint_view
+from mvseg.verification.evidence import Evidence, Ints, paint_view, see_instances
 from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 Bools = NDArray[np.bool_]
@@ -93,7 +93,7 @@ def list_doubts(
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
-    evidence = Shown.of(masks.regions, known, cameras).compare(known)
+    evidence = see_instances(masks.regions, known, cameras)
     free: list[list[int]] = [[] for _ in left]  # rows of each candidate's masks where none of the result lies
     for view, size in enumerate(cameras.sizes.tolist() if known or left else ()):
         taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0

@@ -1,4 +1,5 @@
-"""Text, CSV and YAML files that people write, read whole; each fault is one sentence."""
+"""Text, CSV and YAML files that people write, read whole; each fault is one sentence. And the tables that mvseg
+writes."""
 
 from __future__ import annotations
 
@@ -6,15 +7,21 @@ import codecs
 import csv
 import io
 import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml  # type: ignore[import-untyped]
 
 from mvseg.errors import InputError
+from mvseg.system.atomic import write_text_whole
 
 MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26
 MAX_DEPTH, MAX_DIGITS = 32, 400  # of YAML: PyYAML recurses as deep as Python's stack
+FORMULA_STARTS = ("=", "+", "-", "@")
+NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
+Cell = str | float | None
 
 
 def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:
@@ -76,6 +83,33 @@ def read_table(path: Path, expected: str, *, most: int = MAX_TABLE) -> list[tupl
     width = max((number for _, cells in rows for number, cell in enumerate(cells, start=1) if cell), default=0)
     named = len(rows[0][1]) if rows else 0
     return [(line, cells[: max(width, 1)] if len(cells) == named else cells) for line, cells in rows]
+
+
+def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
+    """Write a CSV file in UTF-8 with a header, whole or not at all, that pandas and spreadsheets open.
+
+    Whole numbers as they are, other numbers by `format_number`, text by `escape_text`, None as "".
+    """
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([columns, *([_as_cell(value) for value in row] for row in rows)])
+    write_text_whole(path, text.getvalue())
+
+
+def _as_cell(value: Cell) -> str | int:
+    if isinstance(value, str):
+        return escape_text(value)
+    return value if isinstance(value, int) else "" if value is None else format_number(value)
+
+
+def format_number(value: float) -> str:
+    """Six significant digits; "" for what is not finite."""
+    return f"{value:.6g}" if np.isfinite(value) else ""
+
+
+def escape_text(text: str) -> str:
+    """Text in one line that no spreadsheet takes for a formula; numbers stay numbers, also negative ones."""
+    text = " ".join(text.split())
+    return f"'{text}" if text.startswith(FORMULA_STARTS) and not NUMBER.fullmatch(text) else text
 
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:

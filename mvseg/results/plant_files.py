@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
+from mvseg.formats.text_file import format_number
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
@@ -20,7 +21,7 @@ from mvseg.results.result import Result
 from mvseg.results.shapes_file import SURFACES_FILE, VOXELS_FILE, write_surfaces, write_voxels
 from mvseg.scene import Scene
 from mvseg.traits.measure import Traits
-from mvseg.traits.table import format_number, write_long, write_wide
+from mvseg.traits.table import write_long, write_wide
 from mvseg.traits.up import level_frame
 
 MAX_FACES = 4000  # triangles of a leaf in scene.glb, at most; its own file has all of them

@@ -48,7 +48,7 @@ from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
 from mvseg.server.vanished import tell_vanished
-from mvseg.system.atomic import lock_place
+from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 
@@ -338,7 +338,7 @@ def open_alone(folder: Path) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(lock_place(folder))
+            stack.enter_context(lock_folder(folder))
         except InputError:
             raise InputError(f"{folder}: another mvseg correct has this result open, expected one at a time") from None
         yield

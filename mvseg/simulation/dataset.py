@@ -15,10 +15,11 @@ from mvseg.errors import InputError
 from mvseg.formats.coco import write_coco
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.run_lengths import encode_mask
+from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
-from mvseg.simulation.scene_writer import write_scene, write_table
+from mvseg.simulation.scene_writer import write_scene
 from mvseg.simulation.wild import make_wild
 from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.system.worker_pool import run_all

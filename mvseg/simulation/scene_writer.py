@@ -14,10 +14,7 @@ and appears whole or not at all.
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -27,10 +24,11 @@ from numpy.typing import NDArray
 from mvseg.errors import InputError
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
+from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.growth import Plant
 from mvseg.simulation.ray_cast import build_stage, render_stage
-from mvseg.system.atomic import folder_whole, write_text_whole
+from mvseg.system.atomic import folder_whole
 
 JPEG_QUALITY = 90
 MIN_PIXELS = 30  # a leaf with fewer visible pixels in a view is left out of that view's masks and truth
@@ -101,10 +99,3 @@ def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
     """Write a photo (H, W, 3); OpenCV's own writer does not report a full disk."""
     options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
     path.write_bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes())
-
-
-def write_table(path: Path, columns: list[str], rows: list[tuple[Any, ...]]) -> None:
-    """Write a CSV file with a header, whole or not at all."""
-    table = io.StringIO()
-    csv.writer(table, lineterminator="\n").writerows([columns, *rows])
-    write_text_whole(path, table.getvalue())

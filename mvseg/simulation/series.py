@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
+from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras
 from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
@@ -35,7 +36,7 @@ from mvseg.simulation.growth import (
     split_into_fronds,
 )  # fmt: skip
 from mvseg.simulation.pot import Part, Pot, draw_pot, make_tube, pot_parts
-from mvseg.simulation.scene_writer import write_scene, write_table
+from mvseg.simulation.scene_writer import write_scene
 from mvseg.simulation.wild import hang, roll_up
 from mvseg.system.atomic import folder_whole
 
@@ -309,7 +310,7 @@ def write_series(folder: Path, specs: Sequence[SeriesSpec]) -> None:
                 scenes.append((name, name, spec.name, time))
                 for leaf in plant.leaves:
                     numbers = (leaf.area, leaf.length, leaf.width, leaf.dryness)
-                    truth.append((spec.name, time, name, leaf.leaf_id, *(f"{number:.6g}" for number in numbers)))
+                    truth.append((spec.name, time, name, leaf.leaf_id, *numbers))
         write_table(partial / SERIES_FILE, ["scene", "name", "plant", "time"], scenes)
         columns = ["plant", "time", "scene", "leaf", "area", "length", "width", "dryness"]
         write_table(partial / TRUTH_FILE, columns, truth)

@@ -1,10 +1,10 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
-What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile;
-`.NAME.open.lock` is, while a program shows a NAME that may be replaced. Where a folder holds files of others, too, its
-own move to `.NAME.mvseg-aside` first, and new ones wait complete in `.NAME.mvseg-ready` until each has its place.
-Locks end with their process: files without one were left by a killed process, and are deleted by the next write to
-NAME. On a disk without locks, two processes must not write to one NAME at the same time.
+What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile. The
+files that it replaces move to `.NAME.mvseg-aside`, then it becomes `.NAME.mvseg-ready`, and its files take their
+places; everything else in NAME stays. Locks end with their process: what a killed process left is put back (no
+`.mvseg-ready` yet) or completed by the next write to NAME. On a disk without locks, two processes must not write to one
+NAME at the same time.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import sys
-import time
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -24,11 +22,9 @@ from filelock import FileLock, Timeout
 
 from mvseg.errors import InputError
 
-PARTIAL, EARLIER, OPEN, LOCK = ".partial", ".earlier", ".open", ".lock"
-ASIDE, READY = ".mvseg-aside", ".mvseg-ready"
-LEFT = (PARTIAL, EARLIER, ASIDE, READY, LOCK)  # what killed runs leave
+PARTIAL, ASIDE, READY, LOCK = ".partial", ".mvseg-aside", ".mvseg-ready", ".lock"
+LEFT = (PARTIAL, ASIDE, READY, LOCK)  # what killed runs leave
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # errors of disks without locks
-WAITS = (0.05, 0.2, 0.5)  # seconds between attempts to rename what another program has open
 
 
 def resolve_place(place: Path) -> Path:
@@ -67,10 +63,7 @@ def is_partial(path: Path) -> bool:
 
 
 def sweep_abandoned(place: Path) -> None:
-    """Delete what killed runs left beside `place` while writing it, unless another run is writing it now.
-
-    If a run was killed between its renames, the earlier folder, or all of its files, are restored; if its new files had
-    begun to take their places, the rest follow.
+    """Complete, undo or delete what killed runs left beside `place`, unless another run is writing it now.
 
     Raises:
         InputError: see `resolve_place`.
@@ -100,16 +93,6 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 @contextmanager
-def lock_place(folder: Path) -> Iterator[None]:
-    """As `lock_folder`, but the lock outlives a folder that is replaced meanwhile: it lies beside it. (Where nothing
-    can be written there, nobody can replace the folder, and the lock lies in it.)"""
-    place = resolve_place(folder)
-    is_fixed = not os.access(place.parent, os.W_OK | os.X_OK)
-    with _locked(place / LOCK if is_fixed else _beside(place, OPEN + LOCK)):
-        yield
-
-
-@contextmanager
 def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a file that exists only while a process holds the lock, or after its holder was killed."""
     if not path.parent.is_dir():  # filelock would make it
@@ -128,14 +111,9 @@ def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     try:
         yield
     finally:
-        try:
-            if sys.platform != "win32":
-                path.unlink(missing_ok=True)  # before the release: a waiting process notices, and makes a new one
-        finally:
-            lock.release()
-        if sys.platform == "win32":
-            with suppress(OSError):  # where a file that another process has opened cannot be deleted
-                path.unlink()
+        with suppress(OSError):  # on Windows, where filelock deletes it
+            path.unlink()  # before the release: a waiting process notices, and makes a new one
+        lock.release()
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
@@ -151,7 +129,7 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         write(partial)
         with partial.open("rb+") as file:
             os.fsync(file.fileno())
-        _rename(partial, path)
+        os.replace(partial, path)
 
 
 def write_text_whole(path: Path, text: str) -> None:
@@ -160,36 +138,15 @@ def write_text_whole(path: Path, text: str) -> None:
 
 
 @contextmanager
-def folder_whole(place: Path) -> Iterator[Path]:
-    """A new folder to write into; moved to `place` when the block ends, or deleted when it raises.
-
-    A folder that is at `place` stays until the new one is complete, and is deleted then. Of several processes, each
-    waits for the one before it.
-
-    Raises:
-        InputError: see `resolve_place`.
-        OSError: the folder cannot be made or moved.
-    """
-    place = resolve_place(place)
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with _writing(place) as partial:
-        partial.mkdir()
-        yield partial
-        if os.path.lexists(place):
-            _rename(place, _beside(place, EARLIER))
-        _rename(partial, place)  # a process that is killed before leaves no `place` until it is swept
-
-
-@contextmanager
-def files_whole(place: Path, earlier: Callable[[Path], Collection[str]]) -> Iterator[Path]:
+def folder_whole(place: Path, replaced: Callable[[Path], Collection[str]] = lambda _: ()) -> Iterator[Path]:
     """A new folder to write into, whose files take the places of earlier ones in `place` when the block ends.
 
-    Everything else in `place` stays where it is: nobody needs to know what it is, nor to stop writing it. Files are
-    moved one by one; what a killed process leaves, the next `sweep_abandoned` undoes, or completes.
+    Of several processes, each waits for the one before it.
 
     Args:
         place: the folder; it may be new.
-        earlier: called with the new folder at the end; returns the names of the files in `place` that are replaced.
+        replaced: called with the new folder at the end; returns the names of the files in `place` that go. Everything
+            else stays where it is: nobody needs to know what it is, nor to stop writing it.
 
     Raises:
         InputError: see `resolve_place`.
@@ -200,28 +157,26 @@ def files_whole(place: Path, earlier: Callable[[Path], Collection[str]]) -> Iter
     with _writing(place) as partial:
         partial.mkdir()
         yield partial
-        names = earlier(partial)
-        if not os.path.lexists(place):
-            _rename(partial, place)
-            return
-        _move_files([name for name in names if os.path.lexists(place / name)], place, _beside(place, ASIDE))
-        _rename(partial, _beside(place, READY))  # from here on the new files win, see `_clear`
+        names = [name for name in replaced(partial) if os.path.lexists(place / name)]
+        _move_files(names, place, _beside(place, ASIDE))
+        os.replace(partial, _beside(place, READY))  # from here on the new files win, see `_clear`
+
+
+def list_files(folder: Path) -> list[str]:
+    """The names of all files and links below a folder, with "/"."""
+    files = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
+    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 def _move_files(names: Collection[str], source: Path, target: Path) -> None:
     """Move files of a folder to the same places in another, and delete the folders that become empty by that."""
     for name in names:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
-        _rename(source / name, target / name)
+        os.replace(source / name, target / name)
     for name in names:
         for folder in Path(name).parents[:-1]:
             with suppress(OSError):  # it holds other files, or is gone
                 (source / folder).rmdir()
-
-
-def _files_below(folder: Path) -> list[str]:
-    files = (path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
-    return sorted(path.relative_to(folder).as_posix() for path in files)
 
 
 @contextmanager
@@ -251,32 +206,13 @@ def _beside(place: Path, kind: str) -> Path:
 def _clear(place: Path) -> None:
     """Complete, undo or delete what is left of an earlier write, under the lock."""
     ready, aside = _beside(place, READY), _beside(place, ASIDE)
-    if ready.is_dir():
-        _move_files(_files_below(ready), ready, place)
-    elif aside.is_dir():
-        _move_files(_files_below(aside), aside, place)
-    earlier = _beside(place, EARLIER)
-    if os.path.lexists(earlier) and not os.path.lexists(place):
-        _rename(earlier, place)
-    for path in (_beside(place, PARTIAL), earlier, ready, aside):
+    for waiting in [ready] if ready.is_dir() else [aside] if aside.is_dir() else []:
+        if os.path.lexists(place):
+            _move_files(list_files(waiting), waiting, place)
+        else:
+            os.replace(waiting, place)
+    for path in (_beside(place, PARTIAL), ready, aside):
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def _rename(source: Path, target: Path) -> None:
-    """Windows refuses as long as another program has one of them open: a virus scanner for a moment, a viewer longer.
-
-    Raises:
-        OSError: it cannot be renamed.
-    """
-    for wait in (*WAITS, None):
-        try:
-            os.replace(source, target)
-            return
-        except PermissionError as error:
-            if wait is None:
-                what = f"{error.strerror}; a program that has it open must close it"
-                raise PermissionError(error.errno, what, str(source if is_partial(target) else target)) from None
-            time.sleep(wait)

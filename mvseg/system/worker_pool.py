@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from importlib import import_module
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
@@ -28,44 +28,32 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_
 AHEAD = 16  # items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
-@contextmanager
-def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
-    """A pool of up to `num_workers` spawned processes, started on demand; None for one: the caller does the work.
-
-    At the end of the block they are stopped at once, whatever they are doing.
-
-    A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
+def start_workers(num_workers: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
+    """A pool of up to `num_workers` processes, see `start_pool`; None for one: the caller does the work.
 
     Raises:
         InputError: fewer than one.
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
-    if num_workers == 1:
-        yield None
-        return
-    with start_pools() as start_pool:
-        yield start_pool(num_workers)
+    return nullcontext() if num_workers == 1 else start_pool(num_workers)
 
 
 @contextmanager
-def start_pools() -> Iterator[Callable[[int], ProcessPoolExecutor]]:
-    """A function that starts a pool of the given number of processes, see `start_workers`; it may be called
-    repeatedly."""
+def start_pool(num_workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of spawned processes, started on demand. At the end of the block they are stopped at once, whatever they
+    are doing.
+
+    A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
+    """
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
-    pools: list[ProcessPoolExecutor] = []
-
-    def start_pool(num_workers: int) -> ProcessPoolExecutor:
-        pools.append(ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,)))
-        return pools[-1]
-
+    pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
     try:
-        yield start_pool
+        yield pool
     finally:
         ours.close()  # an orderly shutdown of the interpreter would take seconds
-        for pool in pools:
-            pool.shutdown(cancel_futures=True)
+        pool.shutdown(cancel_futures=True)
 
 
 def default_workers() -> int:
@@ -77,9 +65,8 @@ def default_workers() -> int:
 def load_ahead(workers: ProcessPoolExecutor | None, num_workers: int, module: str) -> None:
     """Let all processes of a pool start and load a module, which takes seconds, before anybody waits for them."""
     if workers is not None:
-        with one_thread():
-            for _ in range(num_workers):
-                workers.submit(import_module, module)
+        for _ in range(num_workers):
+            workers.submit(import_module, module)
 
 
 def map_in_order(
@@ -101,9 +88,8 @@ def map_in_order(
     asked: deque[Future[tuple[Answer, list[Warning]]]] = deque()
     try:
         for item in items:
-            with one_thread():
-                # pickled here: multiprocessing would move tensors into shared memory, which containers have little of
-                asked.append(workers.submit(_answer, pickle.dumps((work, item))))
+            # pickled here: multiprocessing would move tensors into shared memory, which containers have little of
+            asked.append(workers.submit(_answer, pickle.dumps((work, item))))
             if len(asked) > AHEAD:
                 yield _receive(asked.popleft())
         while asked:
@@ -123,8 +109,9 @@ def run_all(work: Callable[[Item], Answer], items: Iterable[Item], num_workers: 
 
 
 def _start_worker(parent: Connection) -> None:
-    """Prepare a process of the pool: OpenCV and torch use one thread; it exits as soon as the parent closes its end of
-    the pipe or dies, and silently on SIGTERM (pycolmap's handler would print a trace).
+    """Prepare a process of the pool: its libraries use one thread, those that its main module loaded, too; it exits as
+    soon as the parent closes its end of the pipe or dies, and silently on SIGTERM (pycolmap's handler would print a
+    trace).
 
     Ctrl-C is left to the parent. A worker that outlives a killed parent would continue with its queue and interfere
     with the next run.
@@ -132,28 +119,16 @@ def _start_worker(parent: Connection) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    os.environ.update(dict.fromkeys(THREADS, "1"))  # libraries look when they are loaded
     import cv2  # takes seconds, in which the parent may be killed
     import torch
+    from threadpoolctl import threadpool_limits
     from tqdm import tqdm
 
     tqdm.set_lock(threading.RLock())  # instead of one that all processes share, and that has to be given back
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Processes that are started here compute on one thread: libraries look when they are loaded."""
-    earlier = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in earlier.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    threadpool_limits(1)
 
 
 def _end_with(parent: Connection) -> None:

@@ -1,4 +1,4 @@
-"""The tables of tracks: tidy, with text that no spreadsheet takes for a formula; empty cells are missing numbers."""
+"""The tables of tracks, tidy; empty cells are missing numbers."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
 
+from mvseg.formats.text_file import Cell, write_table
 from mvseg.tracking.growth import Growth
 from mvseg.tracking.track import Tracks
-from mvseg.traits.table import as_cells, write_csv
 
 COLUMNS = {
     "tracks.csv": ("plant", "time", "scene", "leaf", "track", "probability", "state"),
@@ -25,10 +25,10 @@ COLUMNS = {
 
 def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
     """Write the four tables of one plant."""
-    rows: dict[str, list[list[str | int]]] = {name: [] for name in COLUMNS}
+    rows: dict[str, list[tuple[Cell, ...]]] = {name: [] for name in COLUMNS}
 
-    def add(file: str, *values: str | float | None) -> None:
-        rows[file].append(as_cells(tracks.plant, *values))
+    def add(file: str, *values: Cell) -> None:
+        rows[file].append((tracks.plant, *values))
 
     for row in tracks.rows:
         date, probability = tracks.dates[row.date], round(row.probability, 4)
@@ -46,7 +46,7 @@ def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
         found = [number for pair in zip(curve.parameters, curve.sds, strict=True) for number in pair]
         add("curves.csv", curve.track, curve.trait, curve.model, *found, curve.residual)
     for name, columns in COLUMNS.items():
-        write_csv(folder / name, columns, rows[name])
+        write_table(folder / name, columns, rows[name])
 
 
 def join_tables(folder: Path, parts: Sequence[Path]) -> None:

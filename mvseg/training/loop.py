@@ -43,8 +43,7 @@ from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.formats.text_file import read_yaml
-from mvseg.results.earlier import RUN_FILE, Output, check_out, claim_folder
+from mvseg.results.earlier import Output, check_out, claim_folder
 from mvseg.system.atomic import lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.training.augmentation import AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
@@ -128,8 +127,7 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     Raises:
         InputError: an output folder that holds something else, broken samples, nothing to train on.
     """
-    if not is_earlier_run(config.output):
-        check_out(config.output, OUTPUT)
+    check_out(config.output, OUTPUT)
     parts, crowd = [], config.coco_crowd
     if config.photos is not None and config.labels is not None:
         parts.append(list_samples(config.photos, config.labels, crowd=crowd))
@@ -308,17 +306,6 @@ def open_files(run: Run, state: TrainingState) -> None:
     sweep_folder(output)
     write_text_whole(output / "config.yaml", yaml.safe_dump(config_values(run.config), sort_keys=False))
     cut_log(output / "log.jsonl", state.step)
-
-
-def is_earlier_run(output: Path) -> bool:
-    """Whether a folder is one of a run of an earlier version, whose run.json did not say so yet."""
-    if (output / RUN_FILE).exists() or not (output / "config.yaml").is_file():
-        return False
-    try:
-        options = read_yaml(output / "config.yaml", "the options of a run")
-    except InputError:
-        return False
-    return isinstance(options, dict) and {"arch", "images_per_forward", "output"} <= options.keys()
 
 
 def cut_log(path: Path, step: int) -> None:

@@ -1,21 +1,14 @@
-"""Traits as tables that pandas and spreadsheets open.
-
-A cell of text that a spreadsheet would run as a formula gets an apostrophe in front. Empty cells are missing numbers.
-"""
+"""Traits as tables that pandas and spreadsheets open, see `write_table`."""
 
 from __future__ import annotations
 
-import csv
-import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from itertools import chain, zip_longest
 from pathlib import Path
 from types import MappingProxyType
 
-import numpy as np
-
 from mvseg.errors import InputError
-from mvseg.formats.text_file import read_table
+from mvseg.formats.text_file import read_table, write_table
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
@@ -23,8 +16,6 @@ from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNK
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
 MOST_BYTES = 1 << 30  # of a table that is read
-FORMULA_STARTS = ("=", "+", "-", "@")
-NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 GOOD, REJECTED = "good", "rejected: "
 
@@ -42,8 +33,8 @@ def write_long(path: Path, traits: Traits) -> None:
                 trait = DEFINITIONS[name]
                 unit = unit_of(trait.kind, traits.unit)
                 about = unit, number.method, trait.ontology, UNIT_ACCESSIONS.get(unit, "")
-                rows.append(as_cells(traits.plant, leaf, name, number.value, number.sd, *about))
-    write_csv(path, COLUMNS, rows)
+                rows.append((traits.plant, leaf, name, number.value, number.sd, *about))
+    write_table(path, COLUMNS, rows)
 
 
 def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = MappingProxyType({})) -> None:
@@ -56,8 +47,8 @@ def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = 
             number = leaf.numbers[trait.name]
             numbers += [number.value, number.sd] if trait.has_sd else [number.value]
         texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or GOOD
-        rows.append(as_cells(traits.plant, leaf.leaf, *numbers, *texts, probabilities.get(leaf.leaf)))
-    write_csv(path, wide_columns(), rows)
+        rows.append((traits.plant, leaf.leaf, *numbers, *texts, probabilities.get(leaf.leaf)))
+    write_table(path, wide_columns(), rows)
 
 
 def wide_columns() -> list[str]:
@@ -106,36 +97,8 @@ def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurem
     )
 
 
-def as_cells(*values: str | float | None) -> list[str | int]:
-    """Whole numbers as they are, other numbers by `format_number`, text by `escape_text`, None as ""."""
-    return [
-        escape_text(value) if isinstance(value, str)
-        else value if isinstance(value, int)
-        else "" if value is None
-        else format_number(value)
-        for value in values
-    ]  # fmt: skip
-
-
-def format_number(value: float) -> str:
-    """Six significant digits; "" for what is not finite."""
-    return f"{value:.6g}" if np.isfinite(value) else ""
-
-
-def escape_text(text: str) -> str:
-    """Text in one line that no spreadsheet takes for a formula; numbers stay numbers, also negative ones."""
-    text = " ".join(text.split())
-    return f"'{text}" if text.startswith(FORMULA_STARTS) and not NUMBER.fullmatch(text) else text
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str | int]]) -> None:
-    """Columns, then rows, as UTF-8."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows([columns, *rows])
-
-
 def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:
-    """The rows of a table that `write_csv` wrote, with these columns and perhaps others, as text.
+    """The rows of a table that `write_table` wrote, with these columns and perhaps others, as text.
 
     Raises:
         InputError: it cannot be read, or has no such column.

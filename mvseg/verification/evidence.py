@@ -8,7 +8,7 @@ Large photos are compared at every second, third ... pixel: leaves that matter a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -166,39 +166,13 @@ def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
     return csc_array((kept, parts.indices, parts.indptr), shape=parts.shape)
 
 
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """What V views show of D masks and K surfaces.
-
-    Attributes:
-        drawn: of V views.
-        instances: (K,) int64, the ids of the surfaces.
-        is_credible: (K,) bool; the others show and hide nothing.
-    """
-
-    drawn: Sequence[Drawn]
-    instances: Ints
-    is_credible: Bools
-
-    @staticmethod
-    def of(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Shown:
-        there = {instance: each for instance, each in surfaces.items() if each.exists}
-        is_credible = np.array([each.is_credible for each in there.values()], bool)
-        return Shown(draw_views(regions, list(there.values()), cameras), np.array(list(there), np.int64), is_credible)
-
-    def compare(self, among: Iterable[int]) -> Evidence:
-        """The evidence if there were only the surfaces of some instances.
-
-        Args:
-            among: their ids; those without a surface do not matter.
-
-        Returns:
-            The columns are instance ids, from 0 on; 0 where there is nothing, and in column 0.
-        """
-        chosen = np.isin(self.instances, list(among)) & self.is_credible
-        seen = see(self.drawn, sum(len(each.rows) for each in self.drawn), chosen)
-        by_id = {}
-        for name, values in vars(seen).items():
-            by_id[name] = np.zeros((len(values), 1 + int(self.instances.max(initial=0))))
-            by_id[name][:, self.instances[chosen]] = values[:, chosen]
-        return Evidence(**by_id)
+def see_instances(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Evidence:
+    """The evidence of D masks and the credible ones of some surfaces. The columns are instance ids, from 0 on; 0 where
+    there is nothing, and in column 0."""
+    credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
+    drawn = draw_views(regions, list(credible.values()), cameras)
+    seen, by_id = see(drawn, len(regions), np.ones(len(credible), bool)), {}
+    for name, values in vars(seen).items():
+        by_id[name] = np.zeros((len(values), 1 + max(surfaces, default=0)))
+        by_id[name][:, list(credible)] = values
+    return Evidence(**by_id)

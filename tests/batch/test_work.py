@@ -88,7 +88,7 @@ def test_what_has_changed_is_done_again(
     if again.status.state == "done":
         assert work_on_scene(tmp_path / "out", CONFIG, scene).is_kept
     else:  # the result itself was changed by hand
-        assert any(words in again.status.sentence for words in ("not an earlier result", "not written by mvseg"))
+        assert any(words in again.status.sentence for words in ("files that are not a result", "not written by mvseg"))
 
 
 def test_other_options_are_done_again(scene: BatchScene, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,6 @@ import pytest
 import torch
 import trimesh
 
-import mvseg.results.earlier
 import mvseg.results.folder
 import mvseg.results.plant_files
 import mvseg.results.report.page
@@ -517,22 +517,27 @@ class TestWholeOrNotAtAll:
 class TestPlaces:
     def test_a_folder_of_other_files_is_refused(self, result: Result, tmp_path: Path) -> None:
         (tmp_path / "thesis.tex").write_text("ten years of work")
-        for run in (None, "", "{}", "[1]", '{"files": 3}', '{"mvseg": "0.1.0"}'):  # other programs write run.json, too
+        others = "", "{}", "[1]", '{"files": 3}', '{"files": {"\\u0000": ""}}', '{"mvseg": "0.1.0"}'
+        for run in (None, *others):  # other programs write run.json, too
             if run is not None:
                 (tmp_path / "run.json").write_text(run)
-            with pytest.raises(InputError, match="holds files that are not an earlier result, expected a new or empty"):
+            with pytest.raises(InputError, match="holds files that are not a result of mvseg infer"):
                 save_result(result, tmp_path, {})
             assert (tmp_path / "thesis.tex").read_text() == "ten years of work"
 
     def test_a_file_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "out").touch()
         for place in (tmp_path / "out", tmp_path / "out" / "below", tmp_path / "out" / "far" / "below"):
-            with pytest.raises(InputError, match=r"the output folder is not writable \(a file is in the way\)"):
+            with pytest.raises(InputError, match=r"the output folder is not writable \(Not a directory"):
                 check_out(place)
 
     def test_no_right_to_write(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(mvseg.results.earlier.os, "access", lambda path, mode: path != tmp_path)
-        with pytest.raises(InputError, match=r"new/out: the output folder is not writable \(no permission to write in"):
+        def refuse(dir: Path) -> None:
+            raise PermissionError(13, "Permission denied", str(dir / "tmp"))
+
+        monkeypatch.setattr("mvseg.system.atomic.TemporaryFile", refuse)
+        message = f"new/out: the output folder is not writable (Permission denied: {tmp_path})"
+        with pytest.raises(InputError, match=re.escape(message)):
             check_out(tmp_path / "new" / "out")
 
     def test_a_device_is_refused(self) -> None:

@@ -16,11 +16,11 @@ from known_leaves import (
     move,
     turn_about,
 )
+from mvseg.formats.text_file import format_number
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.leaf import END, NEED_BASE, NEED_UP, Measurement, measure_leaf, measure_voxels, wrap_azimuth
 from mvseg.traits.ontology import SURFACE_TRAITS, VOXEL_TRAITS
-from mvseg.traits.table import format_number
 from mvseg.traits.up import level_frame
 
 FRAME = level_frame((0.0, 0.0, 1.0))

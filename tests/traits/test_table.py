@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mvseg.formats.text_file import escape_text, format_number
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, PLANT_TRAITS, VOXEL_TRAITS
-from mvseg.traits.table import COLUMNS, escape_text, format_number, read_traits, write_long, write_wide
+from mvseg.traits.table import COLUMNS, read_traits, write_long, write_wide
 
 NAN = float("nan")
 

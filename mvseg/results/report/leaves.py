@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from mvseg.formats.text_file import format_number
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.traits.leaf import Measurement
@@ -21,7 +22,7 @@ from mvseg.traits.ontology import (
     Definition,
     unit_of,
 )
-from mvseg.traits.table import VOXEL_NAMES, format_number
+from mvseg.traits.table import VOXEL_NAMES
 
 COLOURS = ("mean_red", "mean_green", "mean_blue")
 # Not shown until they are asked for.
