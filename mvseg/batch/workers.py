@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from mvseg.errors import InputError
 from mvseg.system.sigterm import held_back
-from mvseg.system.worker_pool import one_thread, start_pools
+from mvseg.system.threads import start_on_one_thread
+from mvseg.system.worker_pool import start_pools
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -110,7 +111,7 @@ def _start_worker(
     worker: ProcessPoolExecutor, work: Callable[[Any], Any]
 ) -> dict[Future[Any], tuple[None, ProcessPoolExecutor]]:
     # it inherits the blocked signals: Ctrl-C is left to the parent
-    with one_thread(), held_back(signal.SIGINT):
+    with start_on_one_thread(), held_back(signal.SIGINT):
         return {worker.submit(_load, work): (None, worker)}
 
 

@@ -12,16 +12,16 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from mvseg.system.say import say_beside_bars
+from mvseg.system.threads import on_one_thread
 from mvseg.system.worker_pool import start_workers
 
 
@@ -70,6 +70,7 @@ class Cancelled(Exception):
     """The run is not wanted any more."""
 
 
+NETWORKS = "detect", "learn"  # definition: stages that networks work in
 LINE_SECONDS = 60.0  # between two lines of one stage
 SILENT = Running()
 _NOW: ContextVar[Running] = ContextVar("mvseg_running")
@@ -132,8 +133,7 @@ def running(
 def timed(stage: str) -> Iterator[None]:
     """A stage of a run: `Running.seconds` has its wall time, the sum if it comes more than once.
 
-    NumPy and SciPy use one thread inside: for matrices of 78 x 78, waking the others takes longer than the product.
-    (torch's threads are left alone: networks need them.)
+    It computes on one thread, unless a network does the work (`NETWORKS`).
 
     Raises:
         Cancelled: the run is not wanted any more.
@@ -143,7 +143,7 @@ def timed(stage: str) -> Iterator[None]:
         raise Cancelled
     now.reach(stage)
     begun = time.perf_counter()
-    with threadpool_limits(limits=1, user_api="blas"):
+    with nullcontext() if stage in NETWORKS else on_one_thread():
         yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
 

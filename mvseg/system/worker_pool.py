@@ -21,10 +21,10 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from mvseg.errors import InputError, warn
+from mvseg.system.threads import start_on_one_thread, use_one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 AHEAD = 16  # items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
@@ -77,7 +77,7 @@ def default_workers() -> int:
 def load_ahead(workers: ProcessPoolExecutor | None, num_workers: int, module: str) -> None:
     """Let all processes of a pool start and load a module, which takes seconds, before anybody waits for them."""
     if workers is not None:
-        with one_thread():
+        with start_on_one_thread():
             for _ in range(num_workers):
                 workers.submit(import_module, module)
 
@@ -101,7 +101,7 @@ def map_in_order(
     asked: deque[Future[tuple[Answer, list[Warning]]]] = deque()
     try:
         for item in items:
-            with one_thread():
+            with start_on_one_thread():
                 # pickled here: multiprocessing would move tensors into shared memory, which containers have little of
                 asked.append(workers.submit(_answer, pickle.dumps((work, item))))
             if len(asked) > AHEAD:
@@ -132,28 +132,10 @@ def _start_worker(parent: Connection) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    import cv2  # takes seconds, in which the parent may be killed
-    import torch
+    use_one_thread()  # takes seconds to load them, in which the parent may be killed
     from tqdm import tqdm
 
     tqdm.set_lock(threading.RLock())  # instead of one that all processes share, and that has to be given back
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Processes that are started here compute on one thread: libraries look when they are loaded."""
-    earlier = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in earlier.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _end_with(parent: Connection) -> None:

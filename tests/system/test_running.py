@@ -6,14 +6,18 @@ import io
 import re
 import sys
 import threading
+from collections.abc import Iterator
 from contextvars import copy_context
 
+import cv2
 import numpy as np
 import pytest
+import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mvseg.errors import InputError
-from mvseg.system.running import Running, now_running, progress_bar, running, timed
+from mvseg.system.running import NETWORKS, Running, now_running, progress_bar, running, timed
+from mvseg.system.threads import on_one_thread
 
 
 def test_it_holds_inside_only_and_nests() -> None:
@@ -91,21 +95,40 @@ def test_steps_are_reported_also_where_there_are_none_or_they_cannot_be_counted(
     assert said == ["surfaces: instance 1 of 2", "surfaces: instance 2 of 2", "views: view 1 of 1"]
 
 
-def blas_threads() -> set[int]:
-    """Threads of the libraries that NumPy and SciPy multiply with."""
+def all_threads() -> set[int]:
+    """Threads of torch, OpenCV, and the libraries that NumPy and SciPy multiply with."""
     np.linalg.inv(np.eye(2))  # it is loaded
-    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+    blas = {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+    return blas | {torch.get_num_threads(), cv2.getNumThreads()}
 
 
-def test_stages_multiply_on_one_thread_and_give_back_the_others() -> None:
-    with threadpool_limits(limits=2, user_api="blas"):
-        before = blas_threads()
-        with timed("match"):
-            assert blas_threads() == {1}
-            with timed("surfaces"):
-                assert blas_threads() == {1}
-            assert blas_threads() == {1}
-        assert blas_threads() == before
-        with pytest.raises(ZeroDivisionError), timed("match"):
-            _ = 1 / 0
-        assert blas_threads() == before
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    with threadpool_limits(limits=2, user_api="blas"), on_one_thread():
+        torch.set_num_threads(2)
+        cv2.setNumThreads(2)
+        with threadpool_limits(limits=2, user_api="blas"):
+            yield
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_stages_compute_on_one_thread_and_give_back_the_others() -> None:
+    assert all_threads() == {2}
+    with timed("match"):
+        assert all_threads() == {1}
+        with timed("surfaces"):
+            assert all_threads() == {1}
+        assert all_threads() == {1}
+    assert all_threads() == {2}
+    with pytest.raises(ZeroDivisionError), timed("match"):
+        _ = 1 / 0
+    assert all_threads() == {2}
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_networks_and_they_alone_compute_on_all_threads() -> None:
+    for stage in NETWORKS:
+        with timed(stage):
+            assert all_threads() == {2}
+    computes = on_one_thread()(all_threads)  # as `fit_surfaces`, for those who call it without a run
+    assert computes() == {1} and computes() == {1} and all_threads() == {2}

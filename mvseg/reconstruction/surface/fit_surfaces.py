@@ -35,10 +35,12 @@ from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
+from mvseg.system.threads import on_one_thread
 from mvseg.system.worker_pool import map_in_order
 
 
 @check_arguments
+@on_one_thread()
 def fit_surfaces(
     regions: Regions,
     instance_ids: Tensor,
