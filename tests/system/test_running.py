@@ -131,4 +131,4 @@ def test_networks_and_they_alone_compute_on_all_threads() -> None:
         with timed(stage):
             assert all_threads() == {2}
     computes = on_one_thread()(all_threads)  # as `fit_surfaces`, for those who call it without a run
-    assert computes() == {1} and computes() == {1} and all_threads() == {2}
+    assert [computes(), computes(), all_threads()] == [{1}, {1}, {2}]
