@@ -119,7 +119,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 39_400, "benchmarks": 8_000, "tests": 35_800}
+BUDGET = {"mvseg": 39_400, "benchmarks": 7_600, "tests": 35_800}
 SLACK = 400
 
 

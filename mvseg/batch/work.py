@@ -114,7 +114,7 @@ def _describe_failure(error: Exception, scene: BatchScene) -> Status:
 
 
 def _peak_mb() -> float | None:
-    """Peak memory of this process. (Linux's `ru_maxrss` starts with that of its parent.)"""
+    """Peak memory of this process. (What Linux's `getrusage` says starts with that of its parent.)"""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return round(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3, 1)  # kB

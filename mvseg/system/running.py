@@ -180,9 +180,7 @@ def progress_bar(
     """tqdm's bar with a name in front, hidden where the run is silent. On a terminal, each takes the line of the one
     before; in a file or a pipe, each name has a line at its end, and one a minute until then."""
     now = now_running()
-    if now.report is not None:
-        return _Reported(items, name, total, unit=unit, disable=True)
-    if now.progress and now.whole is not None:
+    if now.report is not None or (now.progress and now.whole is not None):
         return _Part(items, name, total, unit=unit)
     if not now.progress or sys.stderr.isatty():
         form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
@@ -193,33 +191,21 @@ def progress_bar(
     return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
 
 
-class _Reported(tqdm):  # type: ignore[misc]  # it has no types
-    """A bar that somebody else shows."""
-
-    def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, **how: Any) -> None:
-        super().__init__(items, name, total, **how)
-        self.words = name, how["unit"]
-
-    def __iter__(self) -> Iterator[Any]:
-        now, (name, unit) = now_running(), self.words
-        for number, item in enumerate(self.iterable, start=1):
-            if now.is_cancelled():
-                raise Cancelled
-            if now.report is not None:
-                now.report(f"{name}: {unit} {number} of {self.total}")
-            yield item
-
-
 class _Part:
-    """A bar of one stage, as a part of the whole command's; in a file or a pipe, a name has a line at its first end."""
+    """A bar of one stage: told to who asked for reports, or a part of the whole command's line; in a file or a pipe, a
+    name has a line at its first end."""
 
     def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, *, unit: str) -> None:
-        self.items, self.name, self.unit, self.number = items, name, unit, 0
+        self.items, self.name, self.unit, self.n = items, name, unit, 0
         self.total = len(items) if total is None and isinstance(items, Sized) else total
 
     def __iter__(self) -> Iterator[Any]:
         with self:
             for item in self.items or ():
+                if (now := now_running()).report is not None:
+                    if now.is_cancelled():
+                        raise Cancelled
+                    now.report(f"{self.name}: {self.unit} {self.n + 1} of {self.total}")
                 yield item
                 self.update()
 
@@ -228,22 +214,22 @@ class _Part:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._show(ends=True)
         now = now_running()
-        self._show(now.whole, ends=True)
         if now.whole is not None and not sys.stderr.isatty() and self.name not in now.told:
             now.told.add(self.name)
             say(now.whole.text, to_stderr=True)
 
     def update(self, more: int = 1) -> None:
         """So many more are done."""
-        self.number += more
-        self._show(now_running().whole, ends=False)
+        self.n += more
+        self._show(ends=False)
 
-    def _show(self, whole: WholeCommand | None, *, ends: bool) -> None:
-        if whole is not None:
+    def _show(self, *, ends: bool) -> None:
+        if (whole := now_running().whole) is not None:
             count = f" of {self.total}" if self.total else ""
-            part = min(1.0, self.number / self.total) if self.total else 0.0
-            whole.advance(part, f"{self.name}: {self.unit} {self.number}{count}", ends=ends)
+            part = min(1.0, self.n / self.total) if self.total else 0.0
+            whole.advance(part, f"{self.name}: {self.unit} {self.n}{count}", ends=ends)
 
 
 class _Lines(tqdm):  # type: ignore[misc]  # it has no types
