@@ -30,10 +30,10 @@ fuzz: $(VENV)/complete
 	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
 	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest -m "" tests/test_kill.py
 
-# minutes; PREVIOUS=DIR takes turns with another checkout; FULL=--full renders more scenes at first; FULL=--threads_only
-# measures one thread against two, and nothing else
+# minutes to hours; PREVIOUS=DIR takes turns with another checkout; SCENES=DIR... are measured in place of simulated ones
 bench: $(VENV)/complete
-	$(PYTHON) -m benchmarks.speed $(FULL) $(if $(PREVIOUS),--previous $(PREVIOUS)) --cache results/speed --into docs
+	$(PYTHON) -m benchmarks.speed $(SCENES) $(if $(PREVIOUS),--previous $(PREVIOUS)) $(if $(SKINS),--skins $(SKINS)) \
+	    --cache results/speed --threads 1 2 8 --into docs/performance.md
 
 lint: $(VENV)/complete
 	$(PYTHON) -m ruff check .

@@ -1,1 +1,1 @@
-"""How long the stages take, and how that grows: `python -m benchmarks.speed`."""
+"""What a run costs: `python -m benchmarks.speed`."""

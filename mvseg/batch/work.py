@@ -9,9 +9,6 @@ import traceback
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
-import torch
-
 from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state, write_status
@@ -25,6 +22,7 @@ from mvseg.runs.one_scene import save_scene, solve_scene
 from mvseg.runs.request import RunRequest
 from mvseg.system.atomic import lock_folder, sweep_abandoned
 from mvseg.system.file_hash import hash_files
+from mvseg.system.threads import stay_on_one_thread
 
 _one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings are caught for the whole process
 
@@ -43,8 +41,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     Raises:
         OSError: the scene's status cannot be written.
     """
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    stay_on_one_thread()
     folder, place, started = scene_state(out, scene.name), out / scene.name, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     with _one_at_a_time, lock_folder(folder, wait=True):
@@ -117,7 +114,7 @@ def _describe_failure(error: Exception, scene: BatchScene) -> Status:
 
 
 def _peak_mb() -> float | None:
-    """Peak memory of this process. (Linux's `ru_maxrss` starts with that of its parent.)"""
+    """Peak memory of this process. (What Linux's `getrusage` says starts with that of its parent.)"""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return round(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3, 1)  # kB

@@ -12,6 +12,7 @@ from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_ru
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
+from mvseg.system.running import report_step
 from mvseg.system.say import say
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
+    report_step("starting")  # the imports take seconds
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.runs.request import RunRequest

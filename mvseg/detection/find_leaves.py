@@ -33,7 +33,12 @@ class Detector(Protocol):
     def parameters(self) -> Iterator[Tensor]: ...
 
     def match_detections(
-        self, detections: Sequence[dict[str, Tensor]], cameras: Cameras, *, min_score: float
+        self,
+        detections: Sequence[dict[str, Tensor]],
+        cameras: Cameras,
+        *,
+        min_score: float,
+        residual_px: int | None = None,
     ) -> Matching: ...
 
 
@@ -79,9 +84,14 @@ class Look:
 
     def match(self, cameras: Cameras, min_score: float) -> Matching:
         """Those that score `min_score` or more, matched with the V cameras of the photos, in their frames; `labels` are
-        rows of `proposals`."""
+        rows of `proposals`. The reprojection error is that of `sure`: the poses are the same."""
         with timed("match"):
-            matching = self.model.match_detections(self.detections, self._posed(cameras), min_score=min_score)
+            matching = self.model.match_detections(
+                self.detections,
+                self._posed(cameras),
+                min_score=min_score,
+                residual_px=self.sure.report.residual_px,
+            )
         return matching if self.boxes is None else matching.with_masks(place_crops(matching.masks, self.boxes))
 
     def _posed(self, cameras: Cameras) -> Cameras:

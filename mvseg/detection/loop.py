@@ -27,6 +27,7 @@ def match_proposals(
     cluster_iou: float = 0.3,
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
+    residual_px: int | None = None,
 ) -> Matching:
     """Match first, alternate assignment and NMS, then discard boxes that no other view backs: steps 2 to 4 of
     `MultiViewMaskRCNN`.
@@ -39,6 +40,7 @@ def match_proposals(
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
         detections_per_view: at most this many are kept in a view, best scores first.
         match: how regions are matched.
+        residual_px: the reprojection error, where an earlier matching with these cameras has found it; None: estimated.
 
     Returns:
         The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
@@ -53,7 +55,7 @@ def match_proposals(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         keep = suppress(per_class)
-        matching = match_masks(proposals.select(keep), cameras, match)
+        matching = match_masks(proposals.select(keep), cameras, match, residual_px=residual_px)
         rematch = partial(
             match_masks,
             cameras=cameras,

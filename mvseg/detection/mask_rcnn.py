@@ -170,13 +170,22 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         cameras: Cameras,
         *,
         min_score: float = 0.0,
+        residual_px: int | None = None,
     ) -> Matching:
         """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
-        that score `min_score` or more. `labels` of its regions are rows of the excessive set, view after view."""
-        matching = self._match(detections, cameras.to("cpu"), min_score=min_score)
+        that score `min_score` or more. `labels` of its regions are rows of the excessive set, view after view.
+        `residual_px`: see `match_proposals`."""
+        matching = self._match(detections, cameras.to("cpu"), min_score=min_score, residual_px=residual_px)
         return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(self, detections: Sequence[dict[str, Tensor]], cameras: Cameras, *, min_score: float = 0.0) -> Matching:
+    def _match(
+        self,
+        detections: Sequence[dict[str, Tensor]],
+        cameras: Cameras,
+        *,
+        min_score: float = 0.0,
+        residual_px: int | None = None,
+    ) -> Matching:
         """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
         with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
             proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
@@ -189,6 +198,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
                 cluster_iou=self.cluster_iou,
                 detections_per_view=self.roi_heads.detections_per_img,
                 match=self.match,
+                residual_px=residual_px,
             )
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:

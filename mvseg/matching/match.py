@@ -25,6 +25,7 @@ from mvseg.matching.symnmf import cluster_weights
 from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.system.threads import on_one_thread
 
 MATCHED = "instance_ids", "match_scores", "second_ids", "second_parts"  # columns of `Masks` that matching fills
 
@@ -67,6 +68,7 @@ def match_regions(
     return matching
 
 
+@on_one_thread()
 def _match(
     regions: Regions, cameras: Cameras, config: MatchConfig, *, residual_px: int | None, links: Links
 ) -> Matching:

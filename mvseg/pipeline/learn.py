@@ -32,7 +32,7 @@ from mvseg.pipeline.known import Known
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
-from mvseg.system.running import report_step, timed
+from mvseg.system.running import expected_minutes, report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
 from mvseg.verification.unexplained import is_familiar
@@ -76,6 +76,9 @@ def learn(
                 few = f"the views agree about {labels.num_leaves} leaves, and it takes {LEAST_LEAVES} to learn from"
                 warn(f"the detector has not learned this plant: {few}; outline some (mvseg correct), or give masks")
                 break
+            if number == 1 and rounds is None:
+                how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
+                report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             seen = _learn_once(known, labels, cache)
             expected.append(seen.expected_right)

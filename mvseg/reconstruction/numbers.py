@@ -29,7 +29,7 @@ class VoxelNumbers:
     max_cells: int = 100_000  # limit: cells in all, at which it ends
     max_voxels: int = 200_000_000  # limit: voxels of a grid
     crumb: float = 0.02  # size of a piece below which it is a crumb, as a share of the largest piece's voxels
-    at_once: int = 2_000_000  # limit: balls and masks that are compared at once
+    at_once: int = 8_000_000  # limit: balls and masks that are compared at once
 
 
 @dataclass(frozen=True)
@@ -150,6 +150,7 @@ class SearchNumbers:
     first_steps: int = 3  # limit: steps of the fit before the second one
     most_views: int = 20  # views of an instance that a fit looks at, at most: more add time, and next to nothing else
     few_masks: int = 60  # limit: masks below which they are fitted in this process: others would take longer to start
+    at_once: int = 8  # limit: instances whose starts are searched side by side
     searched_views: int = 12  # limit: views of a leaf in which starts are compared, evenly spread
     most_starts: int = 3  # starts of each hull that are tried, at most
     most_fits: int = 3  # limit: starts that are fitted, but for rough fits

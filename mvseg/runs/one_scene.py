@@ -63,7 +63,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     replaces = " (in place of an earlier result)" if place.is_dir() and any(place.iterdir()) else ""
     cache, finds = place.with_name(f"{place.name}.detections"), request.masks is None
     with ExitStack() as stack:
-        stack.enter_context(running(stages=_plan_stages(request.config, finds=finds)))
+        stack.enter_context(running(plan=_plan_stages(request.config, finds=finds)))
         if finds and stack.enter_context(claim_cache(cache, request.scene, overwrite=request.overwrite)):
             say(f"mvseg: going on from the detections in {cache}, for equal photos and options", to_stderr=True)
         with running(num_workers=num_workers):
@@ -90,12 +90,11 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
                 say(f"mvseg: {word}: {sentence}", to_stderr=True)
 
 
-def _plan_stages(config: RunConfig, *, finds: bool) -> tuple[tuple[str, ...], ...]:
-    """What progress counts, see `Running.stages`."""
-    first = (("detect",), ("match", "choose", "learn", "follow")) if finds else (("match", "follow"),)
-    shapes, traits = (("snap", "surfaces"),), (("voxels", "measure"),)
-    has_shapes = config.reconstruct is not None
-    return (*first, *(shapes if has_shapes else ()), ("check",), *(traits if has_shapes else ()), ("write",))
+def _plan_stages(config: RunConfig, *, finds: bool) -> tuple[str, ...]:
+    """The stages that always come, see `running`."""
+    first = ("load", "detect", "match", "choose") if finds else ("load", "match")
+    shapes, traits = (("snap", "surfaces"), ("voxels", "measure")) if config.reconstruct is not None else ((), ())
+    return (*first, *shapes, "check", *traits, "write")
 
 
 def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:

@@ -10,18 +10,19 @@ import math
 import pickle
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
 
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from mvseg.system.say import say_beside_bars
+from mvseg.system.say import say, say_beside_bars
+from mvseg.system.threads import on_one_thread
+from mvseg.system.whole_command import EXPECTED, WholeCommand
 from mvseg.system.worker_pool import start_workers
 
 
@@ -37,8 +38,7 @@ class Running:
         is_cancelled: asked before each stage, see `timed`.
         report: is told what is done, in words, as it goes on; None: nobody listens.
         told: names of the progress bars that have a line already, where there is no terminal.
-        stages: of the whole run, in order, each with its names in `timed`; (): they are not counted.
-        reached: indices of those that have begun, in order: a run may go back, the count never does.
+        whole: how far the command is, of which this is a part; None: nobody asks.
     """
 
     progress: bool = False
@@ -48,18 +48,7 @@ class Running:
     is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
     report: Callable[[str], None] | None = field(default=None, compare=False)
     told: set[str] = field(default_factory=set, compare=False)
-    stages: tuple[tuple[str, ...], ...] = ()
-    reached: list[int] = field(default_factory=lambda: [0], compare=False)
-
-    def reach(self, name: str) -> None:
-        """A stage with this name begins."""
-        later = range(self.reached[-1] + 1, len(self.stages))
-        self.reached.extend(index for index in later if name in self.stages[index])
-
-    @property
-    def count(self) -> str:
-        """Which stage this is, "" where they are not counted."""
-        return f"stage {self.reached[-1] + 1} of {len(self.stages)}, " if self.stages else ""
+    whole: WholeCommand | None = field(default=None, compare=False)
 
 
 Args = ParamSpec("Args")
@@ -70,6 +59,7 @@ class Cancelled(Exception):
     """The run is not wanted any more."""
 
 
+NETWORKS = "detect", "learn"  # definition: stages that networks work in
 LINE_SECONDS = 60.0  # between two lines of one stage
 SILENT = Running()
 _NOW: ContextVar[Running] = ContextVar("mvseg_running")
@@ -88,7 +78,7 @@ def running(
     keep: bool = False,
     is_cancelled: Callable[[], bool] | None = None,
     report: Callable[[str], None] | None = None,
-    stages: tuple[tuple[str, ...], ...] | None = None,
+    plan: Sequence[str] = (),
 ) -> Iterator[Running]:
     """Let all of mvseg that is called inside the block work so. A thread that is started there does not know of it.
 
@@ -99,7 +89,8 @@ def running(
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
         report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
             None: as outside.
-        stages: see `Running`; progress says which one it is at. None: as outside.
+        plan: stages (`timed`) of the whole command, in order; progress says how long all of them will take. (): as
+            outside.
 
     Raises:
         InputError: fewer than one process.
@@ -112,7 +103,10 @@ def running(
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
         told = outside.told if outside.progress else set()
         report = outside.report if report is None else report
-        planned, reached = (outside.stages, outside.reached) if stages is None else (stages, [0])
+        whole = outside.whole
+        if plan and is_shown:
+            whole = WholeCommand(plan)
+            stack.callback(whole.close)
         now = Running(
             progress=is_shown,
             workers=workers,
@@ -120,8 +114,7 @@ def running(
             is_cancelled=cancelled,
             report=report,
             told=told,
-            stages=planned,
-            reached=reached,
+            whole=whole,
         )
         stack.callback(_NOW.reset, _NOW.set(now))
         yield now
@@ -131,8 +124,7 @@ def running(
 def timed(stage: str) -> Iterator[None]:
     """A stage of a run: `Running.seconds` has its wall time, the sum if it comes more than once.
 
-    NumPy and SciPy use one thread inside: for matrices of 78 x 78, waking the others takes longer than the product.
-    (torch's threads are left alone: networks need them.)
+    It computes on one thread, unless a network does the work (`NETWORKS`).
 
     Raises:
         Cancelled: the run is not wanted any more.
@@ -140,9 +132,10 @@ def timed(stage: str) -> Iterator[None]:
     now = now_running()
     if now.is_cancelled():
         raise Cancelled
-    now.reach(stage)
+    if now.whole is not None:
+        now.whole.begin(stage)
     begun = time.perf_counter()
-    with threadpool_limits(limits=1, user_api="blas"):
+    with nullcontext() if stage in NETWORKS else on_one_thread():
         yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
 
@@ -174,38 +167,68 @@ def report_step(sentence: str) -> None:
         say_beside_bars(sentence)
 
 
+def expected_minutes(stage: str) -> str:
+    """How long a stage will take, in words, if it is to detection as it was measured to be."""
+    seconds = now_running().seconds.get("detect", 0.0) * EXPECTED[stage] / EXPECTED["detect"]
+    return f"some {max(1, round(seconds / 60))} minutes"
+
+
 def progress_bar(
     items: Iterable[Any] | None = None, name: str = "", total: int | None = None, *, unit: str = "step"
 ) -> Any:
     """tqdm's bar with a name in front, hidden where the run is silent. On a terminal, each takes the line of the one
     before; in a file or a pipe, each name has a line at its end, and one a minute until then."""
     now = now_running()
-    if now.report is not None:
-        return _Reported(items, name, total, unit=unit, disable=True)
+    if now.report is not None or (now.progress and now.whole is not None):
+        return _Part(items, name, total, unit=unit)
     if not now.progress or sys.stderr.isatty():
-        form = f"{now.count}{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
+        form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
         return tqdm(items, name, total, unit=unit, bar_format=form, leave=False, disable=not now.progress)
     is_told = name in now.told
     now.told.add(name)
-    form = f"{now.count}{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
+    form = f"{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
     return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
 
 
-class _Reported(tqdm):  # type: ignore[misc]  # it has no types
-    """A bar that somebody else shows."""
+class _Part:
+    """A bar of one stage: told to who asked for reports, or a part of the whole command's line; in a file or a pipe, a
+    name has a line at its first end."""
 
-    def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, **how: Any) -> None:
-        super().__init__(items, name, total, **how)
-        self.words = name, how["unit"]
+    def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, *, unit: str) -> None:
+        self.items, self.name, self.unit, self.n = items, name, unit, 0
+        self.total = len(items) if total is None and isinstance(items, Sized) else total
 
     def __iter__(self) -> Iterator[Any]:
-        now, (name, unit) = now_running(), self.words
-        for number, item in enumerate(self.iterable, start=1):
-            if now.is_cancelled():
-                raise Cancelled
-            if now.report is not None:
-                now.report(f"{name}: {unit} {number} of {self.total}")
-            yield item
+        with self:
+            for item in self.items or ():
+                if (now := now_running()).report is not None:
+                    if now.is_cancelled():
+                        raise Cancelled
+                    now.report(f"{self.name}: {self.unit} {self.n + 1} of {self.total}")
+                yield item
+                self.update()
+
+    def __enter__(self) -> _Part:
+        self.update(0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._show(ends=True)
+        now = now_running()
+        if now.whole is not None and not sys.stderr.isatty() and self.name not in now.told:
+            now.told.add(self.name)
+            say(now.whole.text, to_stderr=True)
+
+    def update(self, more: int = 1) -> None:
+        """So many more are done."""
+        self.n += more
+        self._show(ends=False)
+
+    def _show(self, *, ends: bool) -> None:
+        if (whole := now_running().whole) is not None:
+            count = f" of {self.total}" if self.total else ""
+            part = min(1.0, self.n / self.total) if self.total else 0.0
+            whole.advance(part, f"{self.name}: {self.unit} {self.n}{count}", ends=ends)
 
 
 class _Lines(tqdm):  # type: ignore[misc]  # it has no types

@@ -21,10 +21,10 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from mvseg.errors import InputError, warn
+from mvseg.system.threads import stay_on_one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 AHEAD = 16  # items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
@@ -119,16 +119,10 @@ def _start_worker(parent: Connection) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
-    os.environ.update(dict.fromkeys(THREADS, "1"))  # libraries look when they are loaded
-    import cv2  # takes seconds, in which the parent may be killed
-    import torch
-    from threadpoolctl import threadpool_limits
+    stay_on_one_thread()  # takes seconds, in which the parent may be killed
     from tqdm import tqdm
 
     tqdm.set_lock(threading.RLock())  # instead of one that all processes share, and that has to be given back
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    threadpool_limits(1)
 
 
 def _end_with(parent: Connection) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,11 +11,14 @@ from scipy import ndimage
 from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
 from known_leaves import flat_leaf
 from mvseg.errors import InputError
+from mvseg.reconstruction.numbers import SEARCH
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, start_in
+from mvseg.reconstruction.surface.find_starts import start_in
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.hull import Hull
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
+from mvseg.verification.evidence import paint_view
 
 FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
 CAMERAS = ring_cameras(10)
@@ -108,7 +113,7 @@ def test_of_very_many_views_some_are_looked_at() -> None:
 def test_a_known_start_saves_the_search_for_one(bent: LeafSurface, monkeypatch: pytest.MonkeyPatch) -> None:
     regions, ids = as_regions(blade_masks(BENT, CAMERAS))
     rough = fit_surfaces(regions, ids, CAMERAS, most_views=4)
-    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.carve_hull", None)
+    monkeypatch.setattr("mvseg.reconstruction.surface.find_starts.carve_hull", None)
     surface = fit_surfaces(regions, ids, CAMERAS, starts=rough)[1]
     assert surface.area == pytest.approx(bent.area, rel=5e-3)
     assert surface.length == pytest.approx(bent.length, rel=5e-3)
@@ -291,3 +296,23 @@ def test_cameras_that_all_look_down_show_a_level_leaf(elevation_deg: float, arc_
     surface = fit(blade_masks(FLAT, cameras), cameras)
     assert abs(float(surface.normal[2])) > 0.99
     assert np.abs(errors(surface, FLAT)).max() < 0.02
+
+
+@pytest.mark.parametrize("is_rough", [True, False])
+def test_leaves_that_are_searched_side_by_side_are_those_of_each_alone(
+    is_rough: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slow twin: one after the other, to the bit. Their crops are of different sizes, and one has fewer masks."""
+    cameras = CAMERAS[[0, 2, 4, 6, 8]]
+    leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),
+              2: flat_leaf(length=0.8, half_width=0.35, at=(-0.6, 0.1, 0.0)),
+              3: flat_leaf(length=1.1, half_width=0.2, at=(-0.2, 0.5, 0.1))}  # fmt: skip
+    maps = [paint_view(leaves, cameras, view) for view in range(len(cameras))]
+    maps[1][maps[1] == 2] = 0
+    regions, ids = as_regions(maps)
+    together = fit_surfaces(regions, ids, cameras, is_rough=is_rough)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.SEARCH", replace(SEARCH, at_once=1))
+    for instance, alone in fit_surfaces(regions, ids, cameras, is_rough=is_rough).items():
+        assert torch.equal(together[instance].coefficients, alone.coefficients)
+        assert torch.equal(together[instance].covariance, alone.covariance)
+        assert together[instance].quality == alone.quality

@@ -111,7 +111,7 @@ def test_normal_equations_are_those_of_the_jacobian() -> None:
     distances = outline_distances(stack(), GRID, bent_patch(0), reach=14.0, is_imaged=False)
     assert (distances.place >= 2 * len(GRID.basis)).any()
     weight = np.random.default_rng(0).random(len(distances.px))
-    matrix, right = distances.normal_equations(distances.px, weight)
+    (matrix,), (right,) = distances.normal_equations(distances.px, weight)
     weighted = distances.jacobian * weight[:, None]
     assert matrix == pytest.approx(weighted.T @ distances.jacobian, rel=1e-9, abs=1e-6)
     assert right == pytest.approx(weighted.T @ distances.px, rel=1e-9, abs=1e-6)

@@ -58,8 +58,8 @@ def test_a_leaf_is_fitted_again_only_where_something_that_it_follows_from_change
 ) -> None:
     cache, asked = SurfaceCache(), []
     first, again = fitting._fit_first, fitting._fit_again
-    monkeypatch.setattr(fitting, "_fit_first", lambda each: (asked.append("first"), first(each))[1])
-    monkeypatch.setattr(fitting, "_fit_again", lambda each: (asked.append("again"), again(each))[1])
+    monkeypatch.setattr(fitting, "_fit_first", lambda each: (asked.extend(["first"] * len(each)), first(each))[1])
+    monkeypatch.setattr(fitting, "_fit_again", lambda each: (asked.extend(["again"] * len(each)), again(each))[1])
     whole = fit(cache, IDS)
     assert asked == ["first"] * 3 + ["again"] * 3
     asked.clear()

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -135,9 +136,8 @@ def sweep_dilated(
     maps, grown_px = [_padded_labels(regions, view, size) for view, size in enumerate(sizes)], 0
     xy, region = regions.spread_pixels(rays_per_region(len(cameras)) if rays is None else rays)
     for dilation_px in dilations:
-        boxes = [regions.boxes[regions.view_index == view] for view in range(len(cameras))]
-        for labels, of_view in zip(maps, boxes, strict=True):
-            _dilate(labels, of_view, start_px=grown_px, stop_px=dilation_px)
+        for labels in maps:
+            _dilate(labels, dilation_px - grown_px)
         grown_px = dilation_px
         label_maps = _LabelMaps(cameras, maps, [_label_box(labels) for labels in maps])
         yield _sweep_views(label_maps, regions, xy, region=region, title=f"matching, {dilation_px} px")
@@ -176,28 +176,30 @@ def _padded_labels(regions: Regions, view: int, size: list[int]) -> Tensor:
     """(H + 2, W + 2) int16 or int32 region index per pixel, EMPTY elsewhere, in a frame of OUTSIDE."""
     index = torch.arange(1, len(regions) + 1, device=regions.device)
     kind = torch.int16 if len(regions) < 2**15 else torch.int32
-    labels = (regions.label_map(view, index, size) - 1).to(kind)
-    return torch.nn.functional.pad(labels, (1, 1, 1, 1), value=OUTSIDE)
+    padded = torch.full((size[1] + 2, size[0] + 2), OUTSIDE, dtype=kind)
+    padded[1:-1, 1:-1] = regions.label_map(view, index, size)
+    padded[1:-1, 1:-1] -= 1
+    return padded
 
 
-def _dilate(padded: Tensor, boxes: Tensor, *, start_px: int, stop_px: int) -> None:
-    """Grow the regions of a padded label map into EMPTY pixels, in place, from `start_px` to `stop_px` pixels; `boxes`
-    (N, 4) are those of the regions before they grew. Nothing changes far from them."""
-    if not len(boxes):
-        return
-    labels = padded[1:-1, 1:-1]
-    low, high = (boxes[:, :2].amin(0) - stop_px).clamp(min=0).tolist(), (boxes[:, 2:].amax(0) + stop_px).tolist()
-    window = labels[low[1] : high[1], low[0] : high[0]]
-    labels = window.clone()
-    for _ in range(start_px, stop_px):
-        grown = labels.clone()
-        for axis in (0, 1):
-            for start in (0, 1):
-                source = labels.narrow(axis, 1 - start, labels.shape[axis] - 1)
-                patch = grown.narrow(axis, start, labels.shape[axis] - 1)
-                patch.copy_(torch.where(patch < 0, source, patch))
-        labels = grown
-    window.copy_(labels)
+def _dilate(padded: Tensor, num_px: int) -> None:
+    """Grow the regions of a padded label map into EMPTY pixels by so many pixels, in place. A pixel beside several
+    takes the one below, else above, to the right, to the left."""
+    flat, row = padded.numpy().ravel(), padded.shape[1]
+    beside, tag = (row, -row, 1, -1), np.empty(flat.shape, np.int32)
+    is_region, is_empty = flat >= 0, flat[row:-row] == EMPTY
+    near = is_region[2 * row :] | is_region[: -2 * row]
+    near |= is_region[row + 1 : 1 - row] | is_region[row - 1 : -row - 1]
+    place = np.flatnonzero(near & is_empty) + row
+    for _ in range(num_px):
+        grown = flat.take(place + row)
+        for step in beside[1:]:
+            grown = np.where(grown < 0, flat.take(place + step), grown)
+        flat[place] = grown
+        place = np.concatenate([place + step for step in beside])
+        place = place[flat.take(place) == EMPTY]
+        tag[place] = np.arange(len(place))
+        place = place[tag.take(place) == np.arange(len(place))]  # each once
 
 
 def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
@@ -205,15 +207,15 @@ def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
 
     Where a region touches the border of the image its instance may continue, so the box extends to infinity there.
     """
-    inner = labels[1:-1, 1:-1] >= 0
-    ends = []
-    for axis in (0, 1):
-        occupied = inner.any(axis).nonzero()[:, 0].tolist()
-        if not occupied:
-            return None
-        low = -torch.inf if occupied[0] == 0 else float(occupied[0])
-        ends.append((low, torch.inf if occupied[-1] + 1 == inner.shape[1 - axis] else float(occupied[-1] + 1)))
-    return ends[0][0], ends[1][0], ends[0][1], ends[1][1]
+    inner = labels.numpy()[1:-1, 1:-1] >= 0
+    height, width = inner.shape
+    left, top, wide, high = cv2.boundingRect(inner.view(np.uint8))
+    if not wide:
+        return None
+    low = [-torch.inf if first == 0 else float(first) for first in (left, top)]
+    ends = (left + wide, width), (top + high, height)
+    right, bottom = (torch.inf if end == whole else float(end) for end, whole in ends)
+    return low[0], low[1], right, bottom
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""The fit of one leaf patch to the outlines of its masks: reweighted Gauss-Newton."""
+"""The fit of leaf patches to the outlines of their masks: reweighted Gauss-Newton, of several leaves at once."""
 
 from __future__ import annotations
 
@@ -35,13 +35,18 @@ class PatchFit:
     spread: float = 0.0
 
 
-def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> tuple[Floats, Floats]:
-    """A rough patch (26, 3), moved until its outlines are near those of the masks; by how much each is too large (S,).
+def approach_patches(masks: MaskStack, starts: Floats, *, steps: range) -> tuple[Floats, Floats]:
+    """Move rough patches (L, 26, 3) until their outlines are near those of the masks of L leaves (`join_stacks`).
+
+    Each ends where it would alone.
 
     Args:
         steps: FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends.
+
+    Returns:
+        The patches, and by how much each mask is too large (S,), pixels.
     """
-    moved, coefficients = _to_unit_world(masks, start)
+    moved, coefficients = _to_unit_worlds(masks, starts)
     grid = patch_grid(*(FIT.far_grid if steps == FIRST_HALF else FIT.grid))
     offsets = np.zeros(len(masks))
     for step in steps:
@@ -49,25 +54,33 @@ def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> tuple[Fl
         reach = FIT.far_reach + (FIT.near_reach - FIT.far_reach) * share
         distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=False)
         if step >= FIT.offset_from:
-            offsets = _believe(per_view(distances.px, distances.stack, len(masks)), None)
+            measured = per_view(distances.px, distances.stack, len(masks))
+            offsets = np.concatenate([_believe(each, None) for each in masks.split(measured)])
         scale = FIT.far_scale_px + (FIT.least_scale_px - FIT.far_scale_px) * share
-        equations = _weigh(distances, offsets, scale_px=scale)
+        equations = _weigh(distances, masks, offsets, scale_px=scale)
         coefficients = _step(coefficients, equations, FIT.far_step)
-    return _from_unit_world(coefficients, start), offsets
+    return _from_unit_worlds(coefficients, starts), offsets
 
 
 def fit_patch(
     masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None
 ) -> PatchFit:
-    """Move a patch that is nearly right until its outlines, drawn as the masks are, are theirs.
+    """Fit one patch (26, 3) to the masks of its leaf, see `fit_patches`."""
+    return fit_patches(masks, start[None], num_steps=num_steps, errors=errors)[0]
+
+
+def fit_patches(
+    masks: MaskStack, starts: Floats, *, num_steps: int, errors: MaskErrors | None = None
+) -> list[PatchFit]:
+    """Move patches that are nearly right until their outlines, drawn as the masks are, are theirs.
 
     Args:
-        masks: of the leaf.
-        start: (26, 3) coefficients.
-        num_steps: 0 leaves the patch where it is.
-        errors: how the masks of this segmenter err; None: they are right on average over the views.
+        masks: of L leaves, see `join_stacks`.
+        starts: (L, 26, 3) coefficients.
+        num_steps: 0 leaves the patches where they are.
+        errors: how the masks of this segmenter err, for one leaf; None: they are right on average over the views.
     """
-    moved, coefficients = _to_unit_world(masks, start)
+    moved, coefficients = _to_unit_worlds(masks, starts)
     drawn, offsets = np.zeros(len(masks)), np.zeros(len(masks))
     for step in range(num_steps + 1):
         drawn = offsets if errors else drawn
@@ -75,55 +88,69 @@ def fit_patch(
             moved, patch_grid(*FIT.grid), coefficients, reach=FIT.near_reach, is_imaged=True, offsets=drawn
         )
         measured = drawn + per_view(distances.px, distances.stack, len(masks))
-        offsets = _believe(measured, errors)
-        equations = _weigh(distances, offsets - drawn, scale_px=FIT.least_scale_px)
+        offsets = np.concatenate([_believe(each, errors) for each in masks.split(measured)])
+        equations = _weigh(distances, masks, offsets - drawn, scale_px=FIT.least_scale_px)
         if step < num_steps:
             coefficients = _step(coefficients, equations, FIT.near_step)
-    scale = measure_patch(start).length
-    centre_sd = _centre_sd(measured, errors)
-    return PatchFit(
-        coefficients=_from_unit_world(coefficients, start),
-        covariance=_covariance(coefficients, equations, distances.stack, centre_sd=centre_sd) * scale**2,
-        residual_px=_rms_per_view(distances, equations, len(masks)),
-        offsets_px=measured - _centre(measured, errors),
-    )
+    matrices, scales = _normal_matrices(coefficients, equations, measure_patch(coefficients))[0], measure_patch(starts)
+    fitted, rms = _from_unit_worlds(coefficients, starts), masks.split(_rms_per_view(equations, len(masks)))
+    fits = []
+    for leaf, of_leaf in enumerate(masks.split(measured)):
+        own = equations.of_leaf(leaf)
+        stack = own.distances.stack - np.searchsorted(masks.leaf, leaf)
+        covariance = _covariance(matrices[leaf], own, stack, centre_sd=_centre_sd(of_leaf, errors))
+        fits.append(
+            PatchFit(
+                coefficients=fitted[leaf],
+                covariance=covariance * float(scales.length[leaf]) ** 2,
+                residual_px=rms[leaf],
+                offsets_px=of_leaf - _centre(of_leaf, errors),
+            )
+        )
+    return fits
 
 
-def _to_unit_world(masks: MaskStack, start: Floats) -> tuple[MaskStack, Floats]:
-    """Masks and coefficients in a world moved and scaled to a patch: nothing depends on the scene's origin and unit."""
-    centre, scale = start[MIDRIB].mean(0), measure_patch(start).length
-    coefficients = start.copy()
-    coefficients[MIDRIB] -= centre
-    return masks.move_world(centre, scale), coefficients / scale
+def _to_unit_worlds(masks: MaskStack, starts: Floats) -> tuple[MaskStack, Floats]:
+    """Masks and coefficients (L, 26, 3) in worlds moved and scaled to each patch: nothing depends on the scene's origin
+    and unit."""
+    centres, scales = starts[:, MIDRIB].mean(1), measure_patch(starts).length
+    coefficients = starts.copy()
+    coefficients[:, MIDRIB] -= centres[:, None]
+    return masks.move_worlds(centres, scales), coefficients / scales[:, None, None]
 
 
-def _from_unit_world(coefficients: Floats, start: Floats) -> Floats:
-    """Coefficients in the world of the patch that the unit world was made for."""
-    coefficients = coefficients * measure_patch(start).length
-    coefficients[MIDRIB] += start[MIDRIB].mean(0)
+def _from_unit_worlds(coefficients: Floats, starts: Floats) -> Floats:
+    """Coefficients (L, 26, 3) in the world of the patches that the unit worlds were made for."""
+    coefficients = coefficients * measure_patch(starts).length[:, None, None]
+    coefficients[:, MIDRIB] += starts[:, MIDRIB].mean(1)[:, None]
     return coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """What the outlines ask of the coefficients.
+    """What the outlines ask of the coefficients of L patches.
 
-    Where they are, distances (N,) without the offsets of masks, in pixels, weights (N,), and by how much the masks are
-    worse than clean ones (>= 1).
+    Where they are, distances (N,) without the offsets of masks, in pixels, weights (N,), and by how much the masks of
+    each leaf are worse than clean ones (L,), at least 1.
     """
 
     distances: Distances
     px: Floats
     weight: Floats
-    noise: float
+    noise: Floats
+
+    def of_leaf(self, leaf: int) -> _Equations:
+        """Those of one patch."""
+        keep = self.distances.leaf == leaf
+        return _Equations(self.distances.of_leaf(leaf), self.px[keep], self.weight[keep], self.noise[[leaf]])
 
 
-def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
-    """(78, 78): the fit's own, what the views contradict each other by, and what all masks may share.
+def _covariance(matrix: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
+    """(78, 78) of one patch: the fit's own, what the views contradict each other by, and what all masks may share.
 
-    NaN where the normal matrix is singular. The factors were found on simulated leaves, see docs/surfaces.md.
+    NaN where the normal matrix (78, 78) is singular. The factors were found on simulated leaves, see docs/surfaces.md.
     """
-    inverse = invert_normal(_normal_matrix(coefficients, equations, measure_patch(coefficients))[0])
+    inverse = invert_normal(matrix)
     weight, px = equations.weight, equations.px
     num_views = int(stack.max(initial=0)) + 1
     jacobian = equations.distances.jacobian
@@ -152,14 +179,14 @@ def invert_normal(matrix: Floats) -> Floats:
     return np.asarray(np.linalg.inv(matrix), dtype=float)
 
 
-def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equations:
+def _weigh(distances: Distances, masks: MaskStack, offsets: Floats, *, scale_px: float) -> _Equations:
     """Robust weights, after what the masks of each view (S,) are all too large or too small by is taken off."""
-    px = distances.px - offsets[distances.stack]
-    spread = float(np.median(np.abs(px))) if len(px) else 0.0
-    scale = max(scale_px, FIT.scale_factor * spread)
-    weight = FIT.sample_weight * distances.weight / (1 + (px / scale) ** 2)
-    weight = weight * _view_weights(px, distances.stack, len(offsets))[distances.stack]
-    noise = max(1.0, 1.48 * spread / FIT.clean_px)
+    px, leaf = distances.px - offsets[distances.stack], distances.leaf
+    spread = np.nan_to_num(per_view(np.abs(px), leaf, distances.num_leaves))
+    scale = np.maximum(scale_px, FIT.scale_factor * spread)
+    weight = FIT.sample_weight * distances.weight / (1 + (px / scale[leaf]) ** 2)
+    weight = weight * _view_weights(px, distances, masks)[distances.stack]
+    noise = np.maximum(1.0, 1.48 * spread / FIT.clean_px)
     return _Equations(distances=distances, px=px, weight=weight, noise=noise)
 
 
@@ -185,11 +212,11 @@ def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
     return errors.centre(known)[1] if errors else float(known.std() / np.sqrt(len(known)))
 
 
-def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
-    """(S,) 1, or less for views whose distances spread more than is usual in the others."""
-    spreads = np.nan_to_num(per_view(np.abs(px), stack, num_views))
-    usual = FIT.noisy_view * max(float(np.median(spreads)), 0.3)
-    return np.minimum(1.0, (usual / np.maximum(spreads, 1e-9)) ** 2)
+def _view_weights(px: Floats, distances: Distances, masks: MaskStack) -> Floats:
+    """(S,) 1, or less for views whose distances spread more than is usual in the others of the leaf."""
+    spreads = np.nan_to_num(per_view(np.abs(px), distances.stack, len(masks)))
+    usual = FIT.noisy_view * np.maximum(per_view(spreads, masks.leaf, distances.num_leaves), 0.3)
+    return np.minimum(1.0, (usual[masks.leaf] / np.maximum(spreads, 1e-9)) ** 2)
 
 
 def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
@@ -203,28 +230,31 @@ def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
     return medians
 
 
-def _normal_matrix(coefficients: Floats, equations: _Equations, size: PatchSize) -> tuple[Floats, Floats]:
-    """(78, 78) and (78,): outlines and prior together, about the present coefficients of a patch of this size."""
+def _normal_matrices(coefficients: Floats, equations: _Equations, size: PatchSize) -> tuple[Floats, Floats]:
+    """(L, 78, 78) and (L, 78): outlines and prior together, about the present coefficients of patches of this size."""
     prior, target = patch_prior(coefficients, size, noise=equations.noise)
-    matrix, right = equations.distances.normal_equations(equations.px, equations.weight)
-    return matrix + prior.T @ prior, right + prior.T @ (target - prior @ coefficients.ravel())
+    matrices, right = equations.distances.normal_equations(equations.px, equations.weight)
+    missing = target[..., None] - prior @ coefficients.reshape(len(prior), -1, 1)
+    return matrices + prior.mT @ prior, right + (prior.mT @ missing)[..., 0]
 
 
 def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[float, float]) -> Floats:
-    """One damped Gauss-Newton step; no point of the patch moves by more than `cap` half-widths."""
+    """One damped Gauss-Newton step; no point of a patch moves by more than `cap` half-widths."""
     damping, cap = damping_and_cap
     size = measure_patch(coefficients)
-    matrix, right = _normal_matrix(coefficients, equations, size)
-    by_vector = np.diag(matrix).reshape(-1, 3).mean(1)  # the same along all axes, however the world is turned
-    matrix[np.diag_indices_from(matrix)] += damping * np.repeat(by_vector, 3)
-    step = np.linalg.solve(matrix, right).reshape(-1, 3)
-    longest = np.linalg.norm(patch_grid(*FIT.grid).basis @ step, axis=1).max()
-    limit = cap * max(size.half_width, FIT.narrow * size.length)
-    return coefficients + step * min(1.0, limit / max(longest, 1e-12))
+    matrices, right = _normal_matrices(coefficients, equations, size)
+    diagonal = np.einsum("lii->li", matrices)  # a view
+    by_vector = diagonal.reshape(len(diagonal), -1, 3).mean(2)  # the same along all axes, however the world is turned
+    diagonal += damping * np.repeat(by_vector, 3, axis=1)
+    step = np.linalg.solve(matrices, right[..., None]).reshape(coefficients.shape)
+    longest = np.linalg.norm(patch_grid(*FIT.grid).basis @ step, axis=-1).max(-1)
+    limit = cap * np.maximum(size.half_width, FIT.narrow * size.length)
+    return coefficients + step * np.minimum(1.0, limit / np.maximum(longest, 1e-12))[:, None, None]
 
 
-def _rms_per_view(distances: Distances, equations: _Equations, num_views: int) -> Floats:
+def _rms_per_view(equations: _Equations, num_views: int) -> Floats:
     """(S,) NaN for a view without samples."""
+    distances = equations.distances
     squares = np.bincount(distances.stack, equations.weight * distances.px**2, num_views)
     with np.errstate(invalid="ignore"):
         rms: Floats = np.sqrt(squares / np.bincount(distances.stack, equations.weight, num_views))

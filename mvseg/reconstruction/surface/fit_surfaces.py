@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments
 from mvseg.reconstruction.numbers import DOUBTS, FIT, SEARCH
-from mvseg.reconstruction.spread_views import spread_directions, spread_views
-from mvseg.reconstruction.surface.fit_patch import FIRST_HALF, SECOND_HALF, PatchFit, approach_patch, fit_patch
-from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
+from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.surface.find_starts import area_cost, find_starts, wide_cost
+from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patch, fit_patches
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
-from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
+from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
 from mvseg.reconstruction.surface.patch_image import (
-    cover_crops,
     crop_ious,
     draw_patch,
     hiding_pixels,
@@ -33,15 +32,16 @@ from mvseg.reconstruction.surface.patch_image import (
     select_hiding,
     view_ious,
 )
-from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache, name_first, name_second
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
+from mvseg.system.threads import on_one_thread
 from mvseg.system.worker_pool import map_in_order
 
 
 @check_arguments
+@on_one_thread()
 def fit_surfaces(
     regions: Regions,
     instance_ids: Tensor,
@@ -135,11 +135,15 @@ class _AskedAgain:
 
 
 def _fit_new(
-    cache: dict[str, Any], asked: Mapping[str, Any], fit: Callable[[Any], Any], workers: ProcessPoolExecutor | None
+    cache: dict[str, Any],
+    asked: Mapping[str, Any],
+    fit: Callable[[Sequence[Any]], list[Any]],
+    workers: ProcessPoolExecutor | None,
 ) -> None:
-    """Fit what is not in the cache yet."""
+    """Fit what is not in the cache yet, `SEARCH.at_once` leaves at a time."""
     new = {name: each for name, each in asked.items() if name not in cache}
-    answers = map_in_order(fit, new.values(), workers)
+    leaves, rest = [*new.values()], range(0, len(new), SEARCH.at_once)
+    answers = chain.from_iterable(map_in_order(fit, (leaves[n : n + SEARCH.at_once] for n in rest), workers))
     name = "refining surfaces" if fit is _fit_again else "fitting surfaces"
     for each, answer in zip(new, progress_bar(answers, name, len(new), unit="instance"), strict=True):
         cache[each] = answer
@@ -178,169 +182,56 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-def _fit_roughly(asked: _Asked) -> LeafSurface:
-    masks, fit = _approach(asked, is_rough=True)
-    if fit is None:
-        return LeafSurface.none(torch.from_numpy(asked.masks.views), "its masks agree on no point")
-    return _surface(masks, fit, offsets=fit.offsets_px, is_judged=False)
+def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface]:
+    return [
+        LeafSurface.none(torch.from_numpy(each.masks.views), "its masks agree on no point")
+        if fit is None
+        else _surface(masks, fit, offsets=fit.offsets_px, is_judged=False)
+        for each, (masks, fit) in zip(asked, _approach(asked, is_rough=True), strict=True)
+    ]
 
 
-def _fit_first(asked: _Asked) -> Approach | None:
-    masks, fit = _approach(asked, is_rough=False)
-    if fit is None:
-        return None
-    views, coefficients, offsets_px = map(torch.from_numpy, (masks.views, fit.coefficients, fit.offsets_px))
-    return Approach(views=views, coefficients=coefficients, offsets_px=offsets_px, spread=fit.spread)
+def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
+    found: list[Approach | None] = []
+    for masks, fit in _approach(asked, is_rough=False):
+        found.append(None)
+        if fit is not None:
+            views, coefficients, offsets_px = map(torch.from_numpy, (masks.views, fit.coefficients, fit.offsets_px))
+            found[-1] = Approach(views=views, coefficients=coefficients, offsets_px=offsets_px, spread=fit.spread)
+    return found
 
 
-def _approach(asked: _Asked, *, is_rough: bool) -> tuple[MaskStack, PatchFit | None]:
-    """The masks that show the leaf, and a fit from a start that is nearly right or from those that are found.
+def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:
+    """The masks that show each leaf, and a fit from a start that is nearly right or from those that are found.
 
     Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
     """
-    masks, start = asked.masks, asked.start
-    masks, starts = (masks, [start]) if start is not None else _find_starts(masks, is_rough=is_rough)
-    fits = [fit_patch(masks, each, num_steps=SEARCH.first_steps) for each in starts]
+    searched = iter(find_starts([each.masks for each in asked if each.start is None], is_rough=is_rough))
+    given = [next(searched) if each.start is None else (each.masks, [each.start]) for each in asked]
+    pairs = [(masks, start) for masks, starts in given for start in starts]
+    if not pairs:
+        return [(masks, None) for masks, _ in given]
+    joined, starts = join_stacks([masks for masks, _ in pairs]), np.array([start for _, start in pairs])
+    fits = iter(fit_patches(joined, starts, num_steps=SEARCH.first_steps))
+    return [(masks, _best_fit(masks, [next(fits) for _ in starts])) for masks, starts in given]
+
+
+def _best_fit(masks: MaskStack, fits: list[PatchFit]) -> PatchFit | None:
     if len(fits) < 2:
-        return masks, fits[0] if fits else None
+        return fits[0] if fits else None
     areas = np.array([measure_sizes(fit.coefficients)[0] for fit in fits])
-    scores = np.array([_fine_rank(masks, fit) - _area_cost(fit.coefficients) for fit in fits])
+    scores = np.array([_fine_rank(masks, fit) - area_cost(fit.coefficients) for fit in fits])
     best = int(scores.argmax())
     weights = np.maximum(0, 1 - (scores[best] - scores) / SEARCH.as_good)
     spread = float(np.sqrt(weights @ (areas / areas[best] - 1) ** 2 / weights.sum()))
-    return masks, replace(fits[best], spread=spread)
-
-
-def _find_starts(masks: MaskStack, *, is_rough: bool) -> tuple[MaskStack, list[Floats]]:
-    """The best of several starts, moved to the masks; and the masks that are right.
-
-    Rough fits have one. They tell leaves from what is none, and among many starts masks of two leaves find one, too,
-    that seems to explain them: so others than the likeliest are only tried where that ends badly. The first hull asks
-    that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
-    """
-    given, axes = masks, masks.axes
-    masks = masks.turn_world(axes)
-    hull = carve_hull(masks)
-    seen = hull.points[hull.is_seen] if hull.is_seen.any() else hull.points
-    if len(seen):
-        is_right = ~find_wrong_masks(masks, seen)
-        if not is_right.all():
-            given, masks = given.select(is_right), masks.select(is_right)
-            hull = carve_hull(masks)
-    if not len(hull.points):
-        return given, []
-    few = _few_views(masks, hull.points.mean(0))
-    found = _Found()
-    for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
-        if found.is_good:
-            break
-        likely = _likely_starts(few, replace(hull, voxels=hull.voxels[keep]), is_rough=is_rough)
-        for starts in (likely[:1], likely[1:]) if is_rough else (likely,):
-            found = found if found.is_good else _try_starts(few, starts, found)
-    best = found.likely_best() if is_rough else found.best(SEARCH.most_fits)
-    return given, [found.patches[index] @ axes for index in best]
-
-
-def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
-    """At most `SEARCH.searched_views` of the views, evenly spread around the middle of the leaf."""
-    matrices, shifts = masks.px_from_world[:, :, :3], masks.px_from_world[:, :, 3:]
-    ways = -np.linalg.solve(matrices, shifts)[..., 0] - middle
-    chosen = spread_directions(ways / np.linalg.norm(ways, axis=1, keepdims=True), SEARCH.searched_views)
-    return masks.select(np.isin(np.arange(len(masks)), chosen))
-
-
-@dataclass(frozen=True, eq=False)
-class _Found:
-    """Patches that were moved to the masks, with their scores; does one explain the masks; the best score half way."""
-
-    patches: tuple[Floats, ...] = ()
-    scores: tuple[float, ...] = ()
-    is_good: bool = False
-    half_way: float = -np.inf
-
-    def best(self, most: int) -> list[int]:
-        """Indices of the patches, the one with the best score first."""
-        return sorted(range(len(self.patches)), key=lambda index: -self.scores[index])[:most]
-
-    def likely_best(self) -> list[int]:
-        """Index of the likeliest patch that none after it beats clearly; nothing without a patch."""
-        best: list[int] = []
-        for index, score in enumerate(self.scores):
-            if not best or score > self.scores[best[0]] + SEARCH.least_gain:
-                best = [index]
-        return best
-
-
-def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found:
-    """Starts moved half the way to the masks, and those of them all of the way that may become the best."""
-    halves = [approach_patch(masks, start, steps=FIRST_HALF)[0] for start in starts]
-    scores = [_rank(masks, patch) - _area_cost(patch) for patch in halves]
-    most = max([found.half_way, *scores])
-    patches, ends, is_good = list(found.patches), list(found.scores), found.is_good
-    for score, half in zip(scores, halves, strict=True):
-        if score > most - SEARCH.hopeless:
-            patch, offsets = approach_patch(masks, half, steps=SECOND_HALF)
-            rank = _rank(masks, patch, offsets)
-            explained = max(0.0, rank - _rank(masks, patch))
-            is_good |= rank + SEARCH.forgiven * explained > SEARCH.good_iou
-            patches.append(patch)
-            ends.append(rank - _area_cost(patch))
-    return _Found(tuple(patches), tuple(ends), is_good, most)
-
-
-def _area_cost(coefficients: Floats) -> float:
-    """What is taken off the rank of a patch before it is compared with others."""
-    return SEARCH.area_cost * float(np.log(measure_sizes(coefficients)[0]))
-
-
-def _likely_starts(masks: MaskStack, hull: Hull, *, is_rough: bool) -> list[Floats]:
-    """How well a start explains the masks, before any fit, tells how likely it is. For a rough fit the first one is
-    enough where it shows clearly how the blade lies."""
-    starts = start_in(hull)
-    if is_rough and starts and _rank(masks, starts[0]) >= SEARCH.clear_iou:
-        return starts[:1]
-    ranks = [_rank(masks, start) for start in starts]
-    return [starts[index] for index in sorted(range(len(ranks)), key=lambda index: -ranks[index])[:SEARCH.most_starts]]
-
-
-def start_in(hull: Hull) -> list[Floats]:
-    """`start_patches` in whole numbers of voxels: many of these are equally far from each other, and in world units
-    rounding, and with it the world's scale, would choose between them."""
-    starts = start_patches(hull.voxels.astype(float))
-    for start in starts:
-        start *= hull.size
-        start[MIDRIB] += hull.corner + 0.5 * hull.size
-    return starts
-
-
-def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
-    """Median IoU over the views, coarsely; less for a patch that is wider than long."""
-    points = patch_grid(*FIT.far_grid).points(coefficients)
-    covered = cover_crops(masks, project_points(masks.px_from_world, points)) > 0
-    return float(np.median(crop_ious(masks, covered, offsets=offsets))) - _wide_cost(coefficients)
+    return replace(fits[best], spread=spread)
 
 
 def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
-    """The same, finely, of the mean IoU: of fits that are nearly as good, medians pick one by chance."""
+    """As `find_starts` ranks, but finely, by the mean IoU: of fits nearly as good, medians pick one by chance."""
     points = patch_grid(*FIT.grid).points(fit.coefficients)
     ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
-    return float(ious.mean()) - _wide_cost(fit.coefficients)
-
-
-def _wide_cost(coefficients: Floats) -> float:
-    size = measure_patch(coefficients)
-    return SEARCH.wide_cost if 2 * size.half_width > size.length else 0.0
-
-
-def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
-    """(S,) bool: masks that hardly any voxel (P, 3) falls into although nothing hides it there: another leaf's.
-
-    None where fewer than three would be left.
-    """
-    inside, free = look_at(masks, points)
-    shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
-    is_wrong = shares < SEARCH.wrong_share * np.median(shares)
-    return is_wrong if (~is_wrong).sum() >= 3 else np.zeros(len(masks), bool)
+    return float(ious.mean() - wide_cost(fit.coefficients))
 
 
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
@@ -364,14 +255,18 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
     )
 
 
-def _fit_again(asked: _AskedAgain) -> LeafSurface:
-    """A leaf fitted to what is its rim, now that all leaves and the errors of the masks are known."""
-    first, masks, errors = asked.approach, asked.masks, asked.errors
-    coefficients = first.coefficients.numpy()
-    points, margin = patch_grid(*FIT.grid).points(coefficients), SEARCH.behind * measure_patch(coefficients).length
-    masks = replace(masks, others=hiding_pixels(masks, points, asked.others, margin=margin))
-    fit = fit_patch(masks, coefficients, num_steps=FIT.num_steps, errors=errors)
-    return _surface(masks, replace(fit, spread=first.spread), offsets=first.offsets_px.numpy(), is_judged=True)
+def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
+    """Leaves fitted to what is their rim, now that all leaves and the errors of the masks are known."""
+    surfaces = []
+    for each in asked:
+        first, coefficients = each.approach, each.approach.coefficients.numpy()
+        points, margin = patch_grid(*FIT.grid).points(coefficients), float(measure_patch(coefficients).length)
+        hiding = hiding_pixels(each.masks, points, each.others, margin=SEARCH.behind * margin)
+        masks = replace(each.masks, others=hiding)
+        fit = fit_patch(masks, coefficients, num_steps=FIT.num_steps, errors=each.errors)
+        fit = replace(fit, spread=first.spread)
+        surfaces.append(_surface(masks, fit, offsets=first.offsets_px.numpy(), is_judged=True))
+    return surfaces
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
@@ -394,8 +289,9 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: boo
         offsets_px=torch.from_numpy(offsets),
     )
     # Where other fits are as good, all deviations are larger by as much as that of the area is.
-    wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
-    surface = replace(surface, covariance=wider * surface.covariance)
+    if fit.spread:
+        wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
+        surface = replace(surface, covariance=wider * surface.covariance)
     if not is_judged:
         return surface
     return replace(surface, quality=Quality((*_judge(surface, lacking), *_judge_shape(masks, points))))

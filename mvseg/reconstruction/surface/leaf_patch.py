@@ -114,35 +114,36 @@ def grid_vertices(points: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PatchSize:
-    """What the prior and the steps of the fit are measured by: length of the midrib and largest half-width."""
+    """What the prior and the steps of the fit are measured by: length of the midrib and largest half-width, of one
+    patch or of several (...)."""
 
-    length: float
-    half_width: float
+    length: Floats
+    half_width: Floats
 
 
 def measure_patch(coefficients: Floats) -> PatchSize:
-    """Length and largest half-width of a patch, world units."""
+    """Length and largest half-width of a patch, or of several (..., 26, 3), world units."""
     points = patch_grid(*FIT.grid).points(coefficients)
-    length = np.linalg.norm(np.diff(points[:, FIT.grid[1] // 2], axis=0), axis=1).sum()
-    width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
-    return PatchSize(length=float(length), half_width=float(width / 2))
+    length = np.linalg.norm(np.diff(points[..., FIT.grid[1] // 2, :], axis=-2), axis=-1).sum(-1)
+    width = np.linalg.norm(np.diff(points, axis=-2), axis=-1).sum(-1).max(-1)
+    return PatchSize(length=length, half_width=width / 2)
 
 
-def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple[Floats, Floats]:
+def patch_prior(coefficients: Floats, size: PatchSize, *, noise: Floats | float) -> tuple[Floats, Floats]:
     """What is expected of leaves, as linear equations about the present coefficients.
 
     Directions (along the midrib, normal) are those of the present patch, so the answer does not depend on how the
     world is turned.
 
     Args:
-        coefficients: (26, 3).
-        size: length and half-width that the standard deviations are relative to.
-        noise: >= 1; fold, curl and shear, which faulty masks say little about, are held nearer to none by it.
+        coefficients: (..., 26, 3).
+        size: (...) length and half-width that the standard deviations are relative to.
+        noise: (...) >= 1; fold, curl and shear, which faulty masks say little about, are held nearer to none by it.
 
     Returns:
-        A (E, 78) and b (E,): A @ coefficients.ravel() should be b with standard deviation 1.
+        A (..., E, 78) and b (..., E): A @ coefficients.ravel() should be b with standard deviation 1.
     """
-    length, half = size.length, size.half_width
+    length, half, noise = (np.asarray(each)[..., None, None] for each in (size.length, size.half_width, noise))
     bend, side, fold = _difference_rows()
     *frames, pieces = _frames(coefficients)
     tangents = _unit(_speed_rows() @ coefficients)
@@ -154,16 +155,18 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
         directions += [along * shear, across * shear, normal * upright]
     # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
     # a narrow one does.
-    directions += [pieces[1][1:-1] * (2 * half / (PRIOR.sway_sd * length**2)), tangents / (PRIOR.speed_sd * length)]
-    equations.append(_along(_directed_rows(), np.concatenate(directions)))
-    target = np.zeros(sum(map(len, equations)))
-    target[-len(tangents) :] = 1 / PRIOR.speed_sd
-    return np.concatenate(equations), target
+    directions += [pieces[1][..., 1:-1, :] * (2 * half / (PRIOR.sway_sd * length**2))]
+    directions += [tangents / (PRIOR.speed_sd * length)]
+    equations.append(_along(_directed_rows(), np.concatenate(directions, -2)))
+    asked = np.concatenate(equations, -2)
+    target = np.zeros(asked.shape[:-1])
+    target[..., -tangents.shape[-2] :] = 1 / PRIOR.speed_sd
+    return asked, target
 
 
 def _along(rows: Floats, directions: Floats) -> Floats:
-    """(E, 78) rows (E, 26) along directions (E, 3)."""
-    return (rows[:, :, None] * directions[:, None, :]).reshape(len(rows), -1)
+    """(..., E, 78) rows (E, 26) along directions (..., E, 3)."""
+    return (rows[:, :, None] * directions[..., None, :]).reshape(*directions.shape[:-1], -1)
 
 
 @cache
@@ -197,17 +200,17 @@ def _frame_counts() -> tuple[int, ...]:
 
 
 def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
-    """Directions along, across and normal to the blade, (count, 3) each, at the places of each of `_frame_counts`."""
+    """Directions along, across and normal to the blade, (..., count, 3) each, at the places of `_frame_counts`."""
     ahead, sideways = _frame_rows()
     along = _unit(ahead @ coefficients)
-    side = sideways @ coefficients[SIDE]
+    side = sideways @ coefficients[..., SIDE, :]
     # Where the side vector vanishes (pointed ends) the mean one stands in.
-    side = side + 1e-3 * coefficients[SIDE].mean(0)
-    across = _unit(side - (side * along).sum(1, keepdims=True) * along)
-    (ax, ay, az), (bx, by, bz) = along.T, across.T
-    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)  # np.cross is slow on few
+    side = side + 1e-3 * coefficients[..., SIDE, :].mean(-2, keepdims=True)
+    across = _unit(side - (side * along).sum(-1, keepdims=True) * along)
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(along, -1, 0), np.moveaxis(across, -1, 0)
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)  # np.cross is slow on few
     ends = np.cumsum(_frame_counts())[:-1]
-    return list(zip(*(np.split(each, ends) for each in (along, across, normal)), strict=True))
+    return list(zip(*(np.split(each, ends, -2) for each in (along, across, normal)), strict=True))
 
 
 @cache

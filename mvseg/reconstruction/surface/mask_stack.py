@@ -24,9 +24,11 @@ Labels = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class MaskStack:
-    """The masks of one leaf in its S views, as crops (S, H, W) of one size.
+    """The masks of one leaf in its S views, as crops (S, H, W) of one size; or of several leaves, see `join_stacks`.
 
     Attributes:
+        leaf: (S,) int64, place of the leaf among those that were joined; 0 of one leaf.
+        sides: (S, 2) int64, columns and rows of each crop, which begins at the top left of (H, W).
         views: (S,) view indices.
         px_from_world: (S, 3, 4) to pixels of the crops.
         pixel_size: side of a pixel of a crop, in pixels of the photo.
@@ -39,6 +41,8 @@ class MaskStack:
         axes: (3, 3) in rows, of the leaf itself (`find_axes`).
     """
 
+    leaf: NDArray[np.int64]
+    sides: NDArray[np.int64]
     views: NDArray[np.int64]
     px_from_world: Floats
     pixel_size: int
@@ -78,16 +82,18 @@ class MaskStack:
     def place_of(self, stack: NDArray, px: Floats) -> NDArray[np.int64]:
         """(P,) where `look_up` looks in flat values."""
         rows, columns = self.size
-        column = np.minimum(np.maximum(px[:, 0], 0), columns - 1).astype(np.int64)
-        row = np.minimum(np.maximum(px[:, 1], 0), rows - 1).astype(np.int64)
+        last = (self.sides - 1).T
+        column = np.minimum(np.maximum(px[:, 0], 0), last[0].take(stack)).astype(np.int64)
+        row = np.minimum(np.maximum(px[:, 1], 0), last[1].take(stack)).astype(np.int64)
         place: NDArray[np.int64] = (stack * rows + row) * columns + column
         return place
 
     def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.floating]:
         """(P, T) of values (S, H, W) at positions (P, T, 2), bilinear between pixel centres."""
         rows, columns = self.size
-        x = np.clip(px[..., 0] - 0.5, 0, columns - 1.001).astype(np.float32)
-        y = np.clip(px[..., 1] - 0.5, 0, rows - 1.001).astype(np.float32)
+        last = (self.sides - 1.001).T[:, stack, None]
+        x = np.minimum(np.maximum(px[..., 0] - 0.5, 0), last[0]).astype(np.float32)
+        y = np.minimum(np.maximum(px[..., 1] - 0.5, 0), last[1]).astype(np.float32)
         column, row = x.astype(np.int64), y.astype(np.int64)
         x, y = x - column, y - row
         left, above = 1 - x, 1 - y
@@ -102,6 +108,8 @@ class MaskStack:
         edges = keep[self.edge_stack]
         return replace(
             self,
+            leaf=self.leaf[keep],
+            sides=self.sides[keep],
             views=self.views[keep],
             px_from_world=self.px_from_world[keep],
             blurred=self.blurred[keep],
@@ -117,11 +125,48 @@ class MaskStack:
         matrices = np.concatenate([self.px_from_world[:, :, :3] @ axes.T, self.px_from_world[:, :, 3:]], 2)
         return replace(self, px_from_world=matrices, axes=self.axes @ axes.T)
 
-    def move_world(self, centre: Floats, scale: float) -> MaskStack:
-        """The same masks for world coordinates (x - centre) / scale; depths are divided by `scale`, too."""
-        shift = self.px_from_world[:, :, :3] @ centre + self.px_from_world[:, :, 3]
-        matrices = np.concatenate([self.px_from_world[:, :, :3], shift[:, :, None] / scale], 2)
-        return replace(self, px_from_world=matrices)
+    def move_worlds(self, centres: Floats, scales: Floats) -> MaskStack:
+        """The same masks for world coordinates (x - centre) / scale of each leaf (L, 3), (L,); depths are divided by
+        `scale`, too."""
+        shift = (self.px_from_world[:, :, :3] @ centres[self.leaf, :, None])[..., 0] + self.px_from_world[:, :, 3]
+        shift = shift / scales[self.leaf, None]
+        return replace(self, px_from_world=np.concatenate([self.px_from_world[:, :, :3], shift[:, :, None]], 2))
+
+    def split(self, values: NDArray) -> list[NDArray]:
+        """Values (S, ...) of the views of each leaf."""
+        return np.split(values, np.flatnonzero(np.diff(self.leaf)) + 1)
+
+
+def join_stacks(stacks: Sequence[MaskStack]) -> MaskStack:
+    """The masks of several leaves, so that one call works on all of them; `axes` and `pixel_size` mean nothing."""
+    counts = [len(each) for each in stacks]
+    first = np.cumsum([0, *counts[:-1]])
+    rows, columns = np.max([each.size for each in stacks], 0)
+
+    def pad(name: str, beyond: int = 0) -> NDArray:
+        crops = [getattr(each, name) for each in stacks]
+        padded = np.full((sum(counts), rows, columns), beyond, crops[0].dtype)
+        for begin, count, crop in zip(first, counts, crops, strict=True):
+            padded[begin : begin + count, : crop.shape[1], : crop.shape[2]] = crop
+        return padded
+
+    def chain(name: str) -> NDArray:
+        return np.concatenate([getattr(each, name) for each in stacks])
+
+    return MaskStack(
+        leaf=np.repeat(np.arange(len(stacks)), counts),
+        sides=chain("sides"),
+        views=chain("views"),
+        px_from_world=chain("px_from_world"),
+        pixel_size=0,
+        blurred=pad("blurred"),
+        inside=pad("inside"),
+        others=pad("others", beyond=FRAME),
+        edge_px=chain("edge_px"),
+        edge_normals=chain("edge_normals"),
+        edge_stack=np.concatenate([each.edge_stack + begin for each, begin in zip(stacks, first, strict=True)]),
+        axes=np.full((3, 3), np.nan),
+    )
 
 
 def stack_masks(
@@ -166,6 +211,8 @@ def stack_masks(
         matrix[:2] = (matrix[:2] - np.array([[x + left], [y + top]]) * matrix[2]) / scale
     edges = [_edge_samples(image) for image in blurred]
     return MaskStack(
+        leaf=np.zeros(len(masks), np.int64),
+        sides=np.tile((columns, rows), (len(masks), 1)),
         views=np.asarray(views, dtype=np.int64),
         px_from_world=px_from_world,
         pixel_size=scale,

@@ -8,8 +8,9 @@ rim: there the patch only has to cover the mask, and a negative distance does no
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -149,6 +150,8 @@ class Distances:
         gradient: (N, 3) change of the pixel position along the normal per world unit.
         weight: (N,).
         grid: that the places are of.
+        leaf: (N,) place of the patch among L patches.
+        num_leaves: L.
     """
 
     stack: NDArray[np.int64]
@@ -157,6 +160,14 @@ class Distances:
     gradient: Floats
     weight: Floats
     grid: PatchGrid
+    leaf: NDArray[np.int64]
+    num_leaves: int
+
+    def of_leaf(self, leaf: int) -> Distances:
+        """Those of one patch."""
+        keep = self.leaf == leaf
+        names = "stack", "px", "place", "gradient", "weight", "leaf"
+        return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     @property
     def jacobian(self) -> Floats:
@@ -165,20 +176,26 @@ class Distances:
         return (basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), 3 * basis.shape[1])
 
     def normal_equations(self, px: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """J' W J (78, 78) and J' W px (78,) of the jacobian J, for distances and weights (N,).
+        """J' W J (L, 78, 78) and J' W px (L, 78) of the jacobian J of each patch, for distances and weights (N,).
 
         The same place is seen in many views: what these ask of it is added up before it is spread over coefficients.
         """
-        is_asked = np.bincount(self.place, minlength=len(self.grid.outline_basis)) > 0
-        places, index = np.flatnonzero(is_asked), (is_asked.cumsum() - 1)[self.place]
-        basis = self.grid.outline_basis[places]
+        num_places = len(self.grid.outline_basis)
+        place = self.leaf * num_places + self.place
+        is_asked = np.bincount(place, minlength=self.num_leaves * num_places) > 0
+        places, index = np.flatnonzero(is_asked), (is_asked.cumsum() - 1)[place]
+        basis = self.grid.outline_basis[places % num_places]
         ahead = np.ascontiguousarray(self.gradient.T)
         pulled = ahead * weight
         asked = np.stack([np.bincount(index, by * along, len(places)) for by in (*ahead, px) for along in pulled], 1)
         size = basis.shape[1]
         spread = (asked[:, :9, None] * basis[:, None]).reshape(len(places), 9 * size)
-        matrix = (basis.T @ spread).reshape(size, 3, 3, size).transpose(0, 1, 3, 2)
-        return matrix.reshape(3 * size, 3 * size), (basis.T @ asked[:, 9:]).ravel()
+        ends = np.searchsorted(places, num_places * np.arange(self.num_leaves + 1))
+        parts = [slice(*each) for each in pairwise(ends.tolist())]
+        matrices = np.array([basis[part].T @ spread[part] for part in parts])
+        matrices = matrices.reshape(-1, size, 3, 3, size).transpose(0, 1, 2, 4, 3)
+        right = np.array([basis[part].T @ asked[part, 9:] for part in parts])
+        return matrices.reshape(-1, 3 * size, 3 * size), right.reshape(-1, 3 * size)
 
 
 def outline_distances(
@@ -192,11 +209,13 @@ def outline_distances(
 ) -> Distances:
     """How far the outline of the patch is from the edges of its masks, both ways; edges beyond `reach` do not count.
 
+    `coefficients` (26, 3), or (L, 26, 3) where the masks of L leaves are joined.
     With `is_imaged` the patch is drawn and blurred as the masks are, and its own edge takes the place of its outline:
     tips narrower than a pixel and notches lose the same on both sides. Worth it when the two are near each other.
     With `offsets` (S,), pixels, it is drawn as much too large or small as the masks of each view are.
     """
-    projection = project_points(masks.px_from_world, grid.points(coefficients))
+    coefficients = coefficients.reshape(-1, *coefficients.shape[-2:])
+    projection = project_points(masks.px_from_world, grid.points(coefficients)[masks.leaf])
     samples, covered = outline_samples(masks, grid, projection)
     offsets = np.zeros(len(masks)) if offsets is None else offsets
     to_edge, hidden = search_edges(masks, samples, masks.blurred, reach=reach, offsets=offsets)
@@ -224,6 +243,8 @@ def outline_distances(
         gradient=_gradients(masks.px_from_world[both.stack], both, normals),
         weight=np.concatenate([np.ones(len(forth.px)), np.full(len(reverse.px), OUTLINE.reverse_weight)]),
         grid=grid,
+        leaf=masks.leaf[both.stack],
+        num_leaves=len(coefficients),
     )
 
 
@@ -297,7 +318,7 @@ def nearest_samples(
     there = _take(masks.edge_px, edge)
     here = _take(samples.px, own)
     from_edge, from_own = (np.where(at < 0, np.inf, (px**2).sum(2)) for at, px in ((edge, there), (own, here)))
-    square = from_edge[:, :, None] - 2 * there @ here.transpose(0, 2, 1) + from_own[:, None]
+    square = from_edge[:, :, None] - 2 * _products(there, here) + from_own[:, None]
     if not square.size:
         return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
     straight = square.argmin(2)
@@ -305,7 +326,7 @@ def nearest_samples(
     normals = _take(masks.edge_normals, edge)
     nearest_square = np.take_along_axis(square, straight[:, :, None], 2)[:, :, 0]
     pulls = is_outside & (nearest_square > OUTLINE.pull_from_px**2) & np.isfinite(nearest_square)
-    is_other = normals @ _take(samples.normals, own).transpose(0, 2, 1) < OUTLINE.similar
+    is_other = _products(normals, _take(samples.normals, own)) < OUTLINE.similar
     np.copyto(square, np.inf, where=is_other)
     nearest = np.where(pulls, straight, square.argmin(2))
     found = pulls | (np.take_along_axis(square, nearest[:, :, None], 2)[:, :, 0] < (2 * reach) ** 2)
@@ -314,6 +335,12 @@ def nearest_samples(
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     toward = np.where(pulls[view, place][:, None], ahead, normals[view, place])
     return own[view, nearest[view, place]], edge[view, place], toward
+
+
+def _products(first: Floats, second: Floats) -> Floats:
+    """(S, A, B) of vectors (S, A, 2) and (S, B, 2): matrices of other sizes would be multiplied in another order."""
+    products: Floats = first[:, :, None, 0] * second[:, None, :, 0] + first[:, :, None, 1] * second[:, None, :, 1]
+    return products
 
 
 def _take(values: NDArray, places: NDArray) -> NDArray:

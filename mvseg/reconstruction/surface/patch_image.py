@@ -25,11 +25,11 @@ class Projection:
 
 
 def project_points(px_from_world: Floats, points: Floats) -> Projection:
-    """Project grid points (rows, columns, 3) by S matrices (S, 3, 4); depths are kept above zero."""
-    flat = points.reshape(-1, 3)
+    """Project grid points, ([S,] rows, columns, 3), by S matrices (S, 3, 4); depths are kept above zero."""
+    flat = points.reshape(*points.shape[:-3], -1, 3)
     cam = flat @ px_from_world[:, :, :3].transpose(0, 2, 1) + px_from_world[:, None, :, 3]
     depth = np.maximum(cam[..., 2], 1e-9)
-    shape = (len(px_from_world), *points.shape[:2])
+    shape = (len(px_from_world), *points.shape[-3:-1])
     px = np.empty((*depth.shape, 2))
     for axis in (0, 1):  # one after the other: broadcasting over two numbers is slow
         np.divide(cam[..., axis], depth, out=px[..., axis])
@@ -41,7 +41,8 @@ def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
     last = projection.px.shape[1] - 1
     rows, every = (np.unique(np.r_[0:last:2, last]), 2) if last > 20 else (np.arange(last + 1), 1)
     covered = np.zeros((len(masks), *masks.size), np.uint8)
-    fill_grids(list(covered), projection.px[:, rows, ::every])
+    canvases = [canvas[:high, :wide] for canvas, (wide, high) in zip(covered, masks.sides.tolist(), strict=True)]
+    fill_grids(canvases, projection.px[:, rows, ::every])
     return covered
 
 
@@ -74,9 +75,9 @@ def draw_patch(
     With `offsets` (S,), pixels, it is grown or shrunk as the mask of each view seems to be.
     """
     drawn = np.zeros((len(masks), *masks.size), np.float32)
-    beside = IMAGE.drawn_beside + (0 if offsets is None else int(np.ceil(np.abs(offsets).max(initial=0))))
-    low = np.clip(np.floor(projection.px.min((1, 2))) - beside, 0, masks.size[::-1]).astype(int)
-    high = np.clip(np.ceil(projection.px.max((1, 2))) + beside, 0, masks.size[::-1]).astype(int)
+    beside = IMAGE.drawn_beside + (0 if offsets is None else np.ceil(np.abs(offsets))[:, None])
+    low = np.clip(np.floor(projection.px.min((1, 2))) - beside, 0, masks.sides).astype(int)
+    high = np.clip(np.ceil(projection.px.max((1, 2))) + beside, 0, masks.sides).astype(int)
     canvases = [np.zeros((height, width), np.uint8) for width, height in (IMAGE.supersampled * (high - low)).tolist()]
     fill_grids(canvases, IMAGE.supersampled * (projection.px - low[:, None, None]))
     for index, canvas in enumerate(canvases):
