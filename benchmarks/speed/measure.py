@@ -5,6 +5,7 @@ Prints JSON: {stage: [CPU seconds, peak GB]}, wall seconds, and what was found, 
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 import sys
@@ -34,6 +35,9 @@ def measured(stage: str) -> Iterator[None]:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    args = parser.parse_args()
     wall, begun = time.perf_counter(), time.process_time()
     running.timed = measured  # before the stages take it from there
     from mvseg.config import RunConfig
@@ -45,9 +49,10 @@ def main() -> None:
     with TemporaryDirectory() as place, warnings.catch_warnings(), redirect_stdout(sys.stderr):
         warnings.simplefilter("ignore")
         out = Path(place) / "result"
-        run_one_scene(RunRequest(Path(sys.argv[1]), None, out, RunConfig()))
+        run_one_scene(RunRequest(args.scene, None, out, RunConfig()))
         found = json.loads((out / "instances.json").read_text(encoding="utf-8"))["annotations"]
     print(json.dumps({"stages": STAGES, "wall": time.perf_counter() - wall, "found": found}))
 
 
-main()
+if __name__ == "__main__":
+    main()

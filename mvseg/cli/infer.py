@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,7 @@ from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_ru
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
-from mvseg.system.running import report_step
+from mvseg.system.running import now_running
 from mvseg.system.say import say
 
 if TYPE_CHECKING:
@@ -33,7 +34,8 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    report_step("starting")  # the imports take seconds
+    if now_running().progress and sys.stderr.isatty():
+        say("mvseg: starting", to_stderr=True, end="\r")  # the imports take seconds
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.runs.request import RunRequest
