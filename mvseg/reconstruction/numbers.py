@@ -204,6 +204,37 @@ class StemNumbers:
     rounds: int = 5  # limit: rounds of fitting the stem to the bases
 
 
+@dataclass(frozen=True)
+class TubeNumbers:
+    """Tubes that are fitted to masks of stems, and what tells stems from leaves."""
+
+    rows: int = 24  # limit: places along a tube at which it is compared with its masks
+    patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
+    num_steps: int = 12  # limit: steps of the fit
+    far_steps: int = 8  # limit: of these, until edges are looked for nearby only
+    far_reach: float = 14.0  # chosen: pixels within which a sample looks for an edge, at first
+    near_reach: float = 6.0  # chosen: the same in the end
+    far_scale_px: float = 4.0  # chosen: distance that has half the weight of none, at first
+    least_scale_px: float = 0.7  # chosen: the same in the end, at least
+    scale_factor: float = 4.0  # chosen: the same in median distances, at least
+    sample_weight: float = 0.35  # chosen: weight of a sample, as of those of patches
+    end_weight: float = 4.0  # chosen: weight of an end, in that of a sample of a side: there is one of it
+    shorten: float = 0.25  # chosen: weight of a mask that ends before the tube, where that of a longer one is 1
+    damping: float = 0.01  # limit: of a step, as a share of the diagonal
+    most_step: float = 0.1  # limit: way of a coefficient in a step, at most, in lengths of the tube
+    least_radius: float = 0.05  # limit: radius after a step, at least, in the mean one before it
+    bend_sd: float = 0.03  # chosen: deviation of third differences of the axis, in lengths
+    speed_sd: float = 0.05  # chosen: deviation of the speed along a piece of the axis, in lengths
+    taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
+    sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
+    quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
+    beside_px: float = 2.0  # chosen: distance beside the mask within which another instance may hide a part of its width
+    least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
+    most_views: int = 12  # limit: views of a candidate that tell whether it is a stem
+    least_views: int = 3  # limit: views that show the width of a place, for its changes to count
+    width_noise_px: float = 1.0  # chosen: deviation of a width in pixels
+
+
 RAYS = RayNumbers()
 VOXELS = VoxelNumbers()
 HULL = HullNumbers()
@@ -217,3 +248,4 @@ SEARCH = SearchNumbers()
 DOUBTS = DoubtNumbers()
 ERRORS = ErrorNumbers()
 STEM = StemNumbers()
+TUBE = TubeNumbers()

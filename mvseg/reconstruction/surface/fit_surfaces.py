@@ -76,7 +76,7 @@ def fit_surfaces(
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
     workers = now_running().workers if len(regions) >= SEARCH.few_masks else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
-    frames = _instance_frames(regions, instance_ids, cameras)
+    frames = instance_frames(regions, instance_ids, cameras)
     stacks: dict[int, MaskStack] = {}
     fits: dict[int, PatchFit] = {}
     surfaces: dict[int, LeafSurface] = {}
@@ -93,7 +93,7 @@ def fit_surfaces(
         members = members.select(torch.isin(members.view_index, views[spread_views(cameras[views], most)]))
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
-        unfitted[instance] = _stack(members, cameras, frames, instance=instance), rough
+        unfitted[instance] = stack_instance(members, cameras, frames, instance=instance), rough
     answers = map_in_order(partial(_fit_first, is_rough=is_rough), unfitted.values(), workers)
     shown = progress_bar(answers, "fitting surfaces", len(unfitted), unit="instance")
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
@@ -126,7 +126,7 @@ def _ids(instance_ids: Tensor) -> list[int]:
     return instance_ids[instance_ids > 0].unique().tolist()
 
 
-def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
+def instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
     """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
     last = int(instance_ids.max()) if len(instance_ids) else 0
     values = torch.where(instance_ids > 0, instance_ids, max(last, 0) + 1 + torch.arange(len(instance_ids)))
@@ -284,7 +284,7 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
     return is_wrong if (~is_wrong).sum() >= 3 else np.zeros(len(masks), bool)
 
 
-def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
+def stack_instance(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
     """The outlines of one instance, in photos turned to a side of its own; its masks of one view are united."""
     views = members.view_index.unique().tolist()
     united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
