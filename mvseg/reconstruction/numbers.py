@@ -235,6 +235,30 @@ class TubeNumbers:
     width_noise_px: float = 1.0  # chosen: deviation of a width in pixels
 
 
+@dataclass(frozen=True)
+class AxisNumbers:
+    """The axis that leaves point back to, in lengths of the leaf, or of the median leaf."""
+
+    least_leaves: int = 3  # limit: leaves that tell an axis
+    bent_leaves: int = 5  # chosen: leaves from which the axis may bend
+    begins: float = 0.15  # chosen: share of the midrib that tells in which direction it begins
+    lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured
+    longest_petiole: float = 0.8  # chosen: length of a petiole, at most
+    petiole_cost: float = 0.05  # chosen: distance from the axis that a longer petiole is worth, in its length
+    arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (angle between a petiole's chord and its end at the blade)
+    near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
+    near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
+    least_extent: float = 3.0  # chosen: distance between the outer nodes, in median distances of rays, at least
+    least_miss: float = 0.05  # chosen: median distance of rays, at least, for that
+    tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
+    bend_cost: float = 0.2  # chosen: weight against a bend
+    beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths
+    points: int = 40  # limit: points of an axis
+    ray_steps: int = 41  # limit: points of a ray
+    rounds: int = 14  # limit: rounds of fitting the axis
+    straight_rounds: int = 7  # limit: of these, with a straight one
+
+
 RAYS = RayNumbers()
 VOXELS = VoxelNumbers()
 HULL = HullNumbers()
@@ -249,3 +273,4 @@ DOUBTS = DoubtNumbers()
 ERRORS = ErrorNumbers()
 STEM = StemNumbers()
 TUBE = TubeNumbers()
+AXES = AxisNumbers()
