@@ -259,6 +259,42 @@ class AxisNumbers:
     straight_rounds: int = 7  # limit: of these, with a straight one
 
 
+@dataclass(frozen=True)
+class ThinNumbers:
+    """Thin parts in photos, cells of space that show them, and the path through them."""
+
+    longest_px: int = 500  # chosen: longer side of the part of a photo with the plant, at most
+    margin: float = 0.25  # chosen: what is looked at around the plant, as a share of its image
+    beside_px: int = 2  # chosen: distance from a mask within which a leaf may still hide something
+    around_px: int = 15  # chosen: distance to what is around a thin part: it is less wide than this
+    quiet: float = 2.0  # chosen: difference in colour that means nothing, in the median one
+    sure: float = 4.0  # chosen: difference above that which is sure, in the median one
+    least_apart: float = 6.0  # chosen: the same in steps of L, a and b, at least
+    beyond: float = 0.15  # chosen: how far cells reach beyond the leaves, in the extent of these
+    coarse_cells: int = 32  # limit: cells along the plant, at first
+    levels: int = 3  # limit: times that cells are looked at; they are halved in between
+    least_share: float = 0.7  # chosen: mean share of the views that show a cell as thin, at least
+    least_views: int = 3  # limit: views that see a cell, at least
+    view_share: float = 0.35  # chosen: the same as a share of all views
+    around_cells: int = 17  # chosen: side of the cube in which a part is thin or thick, in cells
+    most_filled: float = 0.2  # chosen: share of this cube that shows a thin part, at most
+    most_cells: int = 20_000  # limit: cells through which a path is looked for
+    gap_cells: float = 2.0  # limit: longest step between all cells, in cells
+    bridge_cells: float = 16.0  # chosen: longest step between some of the cells, across what leaves hide, in cells
+    cube_cells: float = 3.0  # limit: side of the cubes of which one cell each has such steps, in cells
+    gap_power: float = 1.5  # chosen: exponent of the cost of a step's length
+    doubt_cost: float = 4.0  # chosen: cost of a cell that no view shows, in that of a sure one
+    touch_cells: float = 8.0  # chosen: distance between a leaf and the cell where its petiole ends, at most
+    touch_cost: float = 30.0  # chosen: cost of entering or leaving a leaf: paths do not run through leaves
+    least_leaves: int = 3  # limit: leaves that are joined, at least
+    least_steps: int = 6  # chosen: cells of a line, at least
+    line_ends: int = 60  # limit: cells of which any two are tried as points of the line of a stem
+    line_cells: float = 2.0  # chosen: distance from the line that has half the weight of none, in cells
+    line_rounds: int = 6  # limit: rounds of fitting the line
+    line_beyond: float = 0.6  # chosen: how far petioles may leave the line beyond its ends, in its length
+    bend_cost: float = 2.0  # chosen: weight against a bend of the line, in that of a cell
+
+
 RAYS = RayNumbers()
 VOXELS = VoxelNumbers()
 HULL = HullNumbers()
@@ -274,3 +310,4 @@ ERRORS = ErrorNumbers()
 STEM = StemNumbers()
 TUBE = TubeNumbers()
 AXES = AxisNumbers()
+THIN = ThinNumbers()
