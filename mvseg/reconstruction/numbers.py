@@ -240,6 +240,9 @@ class AxisNumbers:
     """The axis that leaves point back to, in lengths of the leaf, or of the median leaf."""
 
     least_leaves: int = 3  # limit: leaves that tell an axis
+    least_of_many: int = 4  # chosen: leaves that tell one of several axes
+    most_pairs: int = 200  # limit: pairs of ends of leaves through which lines are tried
+    most_starts: int = 3  # limit: of all lines that are tried, those that a fit starts from
     bent_leaves: int = 5  # chosen: leaves from which the axis may bend
     begins: float = 0.15  # chosen: share of the midrib that tells in which direction it begins
     lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured

@@ -25,7 +25,6 @@ SPIRAL_DEG = np.arange(100.0, 165.0, 2.5)  # definition: divergence angles that 
 LEAST_NODES = 4  # limit: leaves that suggest a phyllotaxis
 
 FIRST_NODE = missing("not measured: the lowest node has none below")
-NO_FOOT = missing("not measured: no view shows the foot of the stem")
 
 
 @dataclass(frozen=True)
@@ -106,7 +105,7 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
     places, misses, along = project_bases(bases, curve)
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     reach = np.append(0, steps.cumsum())
-    foot = reach[1] if source != "leaf bases" else float(along.min(initial=np.inf))
+    foot = reach[1] if source == "masks" else float(along.min(initial=np.inf))
     tangents = np.stack([np.interp(along, reach, axis) for axis in np.gradient(curve, reach, axis=0).T], 1)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     on_axis = np.stack([np.interp(along, reach, axis) for axis in curve.T], 1)

@@ -49,6 +49,12 @@ class LeafBases:
         """Those at an index (M,), or where `keep` (N,) is true."""
         return LeafBases(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
 
+    @staticmethod
+    def join(first: LeafBases, second: LeafBases) -> LeafBases:
+        """Those of both."""
+        names = [field.name for field in fields(LeafBases)]
+        return LeafBases(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
+
 
 def find_ends(surfaces: Mapping[int, LeafSurface]) -> tuple[LeafBases, LeafBases]:
     """Both ends of each surface that exists, as if they were the bases: those at u = 0, and those at u = 1."""
@@ -90,50 +96,53 @@ class BaseAxis:
         tube: of no radius, from the lowest node to the highest one; upwards.
         bases: of N leaves, at the ends that are nearer to the axis.
         is_near: (N,) bool, a leaf whose ray passes near it.
-        reason: why there is none; "" where it is found.
     """
 
     tube: Tube
     bases: LeafBases
     is_near: NDArray[np.bool_]
-    reason: str = ""
 
 
-def axis_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> BaseAxis:
-    """Find the axis that the leaves of a plant point back to.
+def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tuple[BaseAxis, ...]:
+    """Find the axes that the leaves of a plant point back to: of the most leaves first, then of those that are left.
 
     Args:
         surfaces: {instance id: surface} of leaves.
         up: (3,) unit vector; None: not known. Then the side to which most leaves rise is above.
 
     Returns:
-        The axis. There is none for fewer than `AXES.least_leaves` leaves, where fewer than `AXES.near_share` of them
-        point to one curve, and where the nodes lie no farther apart along it than rays miss it, as in a rosette.
+        One axis for each stem; () where fewer than `AXES.near_share` of the leaves point to any, as in a rosette.
     """
     first, second = find_ends(surfaces)
-    if len(first) < AXES.least_leaves:
-        return _none(first, "too few leaves")
+    left, axes = np.ones(len(first), bool), []
+    while left.sum() >= (AXES.least_leaves if left.all() else AXES.least_of_many):
+        axis = _find_axis(first.select(left), second.select(left), up)
+        if axis is None:
+            break
+        axes.append(axis)
+        left[left] = ~axis.is_near
+    return tuple(axes) if len(first) and 1 - left.mean() >= AXES.near_share else ()
+
+
+def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAxis | None:
+    """The axis of the most leaves, of which `first` and `second` are both ends; None where these are too few, or their
+    nodes lie no farther apart along it than their rays miss it."""
     size = float(np.median(first.lengths))
-    starts = _start_lines(first, second, up)
+    starts = _start_lines(first, second, up, size=size)
     found = [_fit_axis(first, second, start, size=size) for start in starts]
     points, bases, distances, along = min(found, key=lambda each: _cost(each[2], size))
     is_near = distances < AXES.near * size
-    if is_near.mean() < AXES.near_share:
-        return _none(bases, "the leaves do not point to one stem")
+    if is_near.sum() < (AXES.least_leaves if is_near.mean() >= AXES.near_share else AXES.least_of_many):
+        return None
     extent = float(np.ptp(along[is_near]))
     if extent < AXES.least_extent * max(float(np.median(distances[is_near])), AXES.least_miss * size):
-        return _none(bases, "the leaves sit at one place: a rosette has no stem to see")
-    direction = points[-1] - points[0]
-    rising = bases.ahead.sum(0) if up is None else up
-    tube = _as_tube(points if direction @ rising >= 0 else points[::-1], distances[is_near])
+        return None
+    rising = bases.ahead[is_near].sum(0) if up is None else up
+    tube = as_tube(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1], distances[is_near])
     return BaseAxis(tube, bases, is_near)
 
 
-def _none(bases: LeafBases, reason: str) -> BaseAxis:
-    return BaseAxis(Tube.none(np.zeros(0, np.int64), reason), bases, np.zeros(len(bases), bool), reason)
-
-
-def _as_tube(points: Floats, distances: Floats) -> Tube:
+def as_tube(points: Floats, distances: Floats) -> Tube:
     """A tube of no radius along points (P, 3), as uncertain as the rays (M,) miss it."""
     nothing = np.zeros(0)
     sd = float(np.sqrt((distances**2).mean() / max(len(distances) - 2, 1) * AXIS / 2))
@@ -142,17 +151,39 @@ def _as_tube(points: Floats, distances: Floats) -> Tube:
     return Tube(fit_axis(points), np.zeros(RADIUS), covariance, views, nothing, nothing, nothing)
 
 
-def _start_lines(first: LeafBases, second: LeafBases, up: Floats | None) -> list[tuple[Floats, Floats]]:
-    """Points and directions of lines that may be near the axis."""
+def _start_lines(
+    first: LeafBases, second: LeafBases, up: Floats | None, *, size: float
+) -> list[tuple[Floats, Floats]]:
+    """Points and directions of lines that may be near an axis: those that most rays pass, of many."""
     bases = first.points
-    middle = np.median(bases, axis=0)
-    every = np.concatenate([first.points, second.points])
-    lines = [(middle, np.linalg.svd(bases - middle)[2][0]), (middle, np.linalg.svd(every - every.mean(0))[2][-1])]
-    meeting = _nearest_to_rays(bases, first.ahead)
-    lines += [(meeting, lines[0][1])]
+    middle, meeting = np.median(bases, axis=0), _nearest_to_rays(bases, first.ahead)
+    along = np.linalg.svd(bases - middle)[2][0]
+    lines = [(middle, along), (meeting, along)]
     if up is not None:
         lines += [(middle, up), (meeting, up)]
-    return lines
+    either = np.concatenate([first.points, second.points])
+    one, other = np.triu_indices(len(either), 1)
+    length = np.linalg.norm(either[other] - either[one], axis=1)
+    pairs = np.flatnonzero((length > AXES.near * size) & (one % len(bases) != other % len(bases)))
+    pairs = pairs[np.linspace(0, len(pairs) - 1, min(len(pairs), AXES.most_pairs)).astype(int)]
+    lines += [(either[one[pair]], either[other[pair]] - either[one[pair]]) for pair in pairs]
+    costs = []
+    for point, direction in lines:
+        ahead = direction / np.linalg.norm(direction)
+        gaps = [_line_gaps(ends, point, ahead) for ends in (first, second)]
+        costs.append(_cost(np.minimum(*gaps), size))
+    best = np.argsort(costs, kind="stable")[: AXES.most_starts]
+    return [lines[index] for index in best.tolist()]
+
+
+def _line_gaps(bases: LeafBases, point: Floats, ahead: Floats) -> Floats:
+    """(N,) how far the rays back from bases pass a line, no longer than petioles are, where length costs a little."""
+    away = bases.points - point
+    away = away - (away @ ahead)[:, None] * ahead
+    back = -bases.ahead + (bases.ahead @ ahead)[:, None] * ahead
+    t = -(away * back).sum(1) / np.maximum((back**2).sum(1), 1e-12)
+    t = np.clip(t, 0, AXES.longest_petiole * bases.lengths)
+    return np.asarray(np.linalg.norm(away + t[:, None] * back, axis=1) + AXES.petiole_cost * t)
 
 
 def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
@@ -181,7 +212,7 @@ def _fit_axis(
     reach = max(float(np.ptp((first.points - middle) @ direction)), size)
     curve = middle + np.linspace(-reach, reach, AXES.points)[:, None] * direction
     for turn in range(AXES.rounds):
-        bases = _choose_ends(first, second, curve)
+        bases = choose_ends(first, second, curve)
         nodes, distances, along = project_bases(bases, curve)
         weight = 1 / (1 + (distances / (AXES.near * size)) ** 2)
         degree = 1 if turn < AXES.straight_rounds or len(bases) < AXES.bent_leaves else 2
@@ -200,7 +231,7 @@ def _fit_axis(
         even = np.linspace(*ends, AXES.points)
         curve = curve[0] + (even * scale + place.mean())[:, None] * chord
         curve = curve + np.stack([even**power for power in range(degree + 1)], 1) @ offset
-    bases = _choose_ends(first, second, curve)
+    bases = choose_ends(first, second, curve)
     _, distances, along = project_bases(bases, curve)
     near = distances < AXES.near * size
     if near.sum() >= 2:  # from the lowest node to the highest one
@@ -210,7 +241,7 @@ def _fit_axis(
     return curve, bases, distances, along
 
 
-def _choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
+def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
     """Of each leaf the end that is nearer to a curve (P, 3)."""
     gaps = [np.linalg.norm(each.points[:, None] - curve, axis=2).min(1) for each in (first, second)]
     is_second = gaps[1] < gaps[0]

@@ -26,12 +26,14 @@ class StemPath:
 
     Attributes:
         points: (P, 3) along it, smooth, from one end to the other.
+        cell: side of a cell.
         miss: median distance of its cells from the smooth line.
         share: mean share of the views that show its cells as thin.
         petioles: {leaf: (n, 3) from the line to the leaf}, n >= 1.
     """
 
     points: Floats
+    cell: float
     miss: float
     share: float
     petioles: Mapping[int, Floats]
@@ -60,7 +62,7 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
     if line is None:
         return None
     points, miss, share = line
-    return StemPath(points, miss, share, _find_petioles(graph, cells, leaves, points))
+    return StemPath(points, cells.size, miss, share, _find_petioles(graph, cells, leaves, points))
 
 
 def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
