@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.stem.leaf_bases import LeafBases, curve_of, project_bases
+from mvseg.reconstruction.stem.leaf_bases import LeafBases, as_tube, curve_of, project_bases
 from mvseg.reconstruction.stem.tube import Tube
 from mvseg.traits.leaf import Measurement, missing, wrap_azimuth
 
@@ -153,6 +153,12 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
             )
         )
     return Stem(number=number, tube=tube, source=source, nodes=tuple(nodes), phyllotaxis=suggest_phyllotaxis(nodes))
+
+
+def thin_tube(places: Sequence[tuple[float, float, float]]) -> Tube:
+    """A tube of no radius from place to place, of which nothing else is known."""
+    points = np.array(places, dtype=float).reshape(-1, 3)
+    return as_tube(points if len(points) > 1 else np.repeat(points, 2, 0), np.zeros(3))
 
 
 def _reference(tangents: Floats, frame: Floats | None) -> Floats:

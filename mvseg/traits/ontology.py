@@ -45,7 +45,8 @@ SURFACE_TRAITS = (
     Definition("tip_inclination", "degree", "of the midrib at the tip against the horizontal, positive = rising"),
     Definition("azimuth", "degree", "direction from base to tip, counterclockwise seen from above, in [0, 360)"),
     Definition("insertion_height", "length", "of the base above the lowest point of all measured leaves"),
-    Definition("insertion_angle", "degree", "between the midrib at the base and up (the stem)", "TO:0000206"),
+    Definition("node_height", "length", "of its node along the stem, from the lowest node"),
+    Definition("insertion_angle", "degree", "between the midrib at the base and the stem, or up", "TO:0000206"),
     Definition("curvature", "degree", "between the midrib's directions at base and tip: 0 = straight"),
     Definition("fold_angle", "degree", "between the two halves of the blade at mid length: 180 = flat"),
 )

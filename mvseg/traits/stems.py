@@ -30,10 +30,14 @@ from mvseg.traits.nodes import Stem, measure_stem
 
 Floats = NDArray[np.float64]
 
-MOST_VIEWS = 12  # limit: photos in which thin parts are looked for
+MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
 LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
 MOST_GAP = 8.5  # chosen: longest step in a petiole that was traced, in cells
-SUPPORTED = 0.5  # chosen: mean share of the views that show the axis of leaf bases as thin, at least, where photos exist
+SUPPORTED = 0.5  # chosen: share of the views that show the axis of leaf bases as thin, at least, where photos exist
+LEAF_SHARE = 0.5  # chosen: leaves that sit on a path, of all, at least
+UPRIGHT = 0.3  # chosen: length of the mean of the directions that are up in the photos, for them to agree
+FAINTEST = 0.25  # chosen: part of an axis that views need not show
+LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
 
 
 def find_stems(
@@ -56,7 +60,8 @@ def find_stems(
     """
     if not surfaces:
         return ()
-    axes = axes_of_bases(surfaces, None if frame is None else frame[2])
+    upward = find_upward(cameras) if frame is None else frame[2]
+    axes = axes_of_bases(surfaces, upward)
     if not photos.exist:
         return _of_bases(axes, frame)
     seen = see_plant(surfaces, masks, cameras, photos=photos)
@@ -64,7 +69,16 @@ def find_stems(
     if axes:
         return _of_bases(axes, frame)
     path = find_path(seen.cells, seen.leaves)
-    return () if path is None else _of_path(path, surfaces, frame)
+    if path is None or seen.support(path.points) < SUPPORTED:
+        return ()
+    return _of_path(path, surfaces, frame, upward)
+
+
+def find_upward(cameras: Cameras) -> Floats | None:
+    """(3,) the direction that is up in most photos: it tells one end of a stem from the other, and no more; None where
+    the photos do not agree."""
+    mean = -cameras.R[:, 1].mean(0).cpu().numpy()
+    return mean / np.linalg.norm(mean) if np.linalg.norm(mean) > UPRIGHT else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +96,11 @@ class SeenPlant:
     leaves: Mapping[int, Floats]
 
     def support(self, points: Floats) -> float:
-        """Mean share of the views that show points (P, 3) as thin, or what is within two cells of them; 0 where hardly
-        any view looks there."""
+        """How far the views show an axis (P, 3) as thin: the share of them that show most of its points so, or what is
+        within two cells of these; 0 where they hardly see any of it."""
         shares = share_of_views(self.views, points, 3 * self.cells.size)
-        return float(shares[shares > 0].mean()) if (shares > 0).any() else 0.0
+        is_seen = np.isfinite(shares)
+        return float(np.quantile(shares[is_seen], FAINTEST)) if is_seen.mean() > LEAST_SEEN else 0.0
 
 
 def see_plant(
@@ -112,22 +127,26 @@ def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None) -> tuple[Stem, .
     )
 
 
-def _of_path(path: StemPath, surfaces: Mapping[int, LeafSurface], frame: Floats | None) -> tuple[Stem, ...]:
+def _of_path(
+    path: StemPath, surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
+) -> tuple[Stem, ...]:
     """The stem of a path, if it has enough leaves.
 
     Petioles that were traced tell the nodes, whichever end of a leaf is its base; of the other leaves the midribs do,
     where they point back to the path.
     """
     ends, others = find_ends(surfaces)
-    rising = (ends.points + others.points).mean(0) / 2 - path.points[0] if frame is None else frame[2]
+    rising = (ends.points + others.points).mean(0) / 2 - path.points[0] if upward is None else upward
     line = path.points if (path.points[-1] - path.points[0]) @ rising >= 0 else path.points[::-1]
     tube = as_tube(line, np.full(len(path.petioles) + 2, path.miss))
     traced = petiole_bases(path, surfaces)
     nearer = choose_ends(ends, others, line)
     nearer = nearer.select(~np.isin(nearer.ids, traced.ids))
     _, gap, _ = project_bases(nearer, curve_of(tube))
-    bases = LeafBases.join(traced, nearer.select(gap < AXES.near * np.median(nearer.lengths, initial=0)))
-    if len(bases) < max(AXES.near_share * len(surfaces), AXES.least_leaves):
+    bases = LeafBases.join(traced, nearer.select(gap < AXES.near * np.median(ends.lengths)))
+    _, _, along = project_bases(bases, curve_of(tube))
+    num_places = 1 + int((np.diff(np.sort(along)) > 2 * path.cell).sum()) if len(along) else 0
+    if len(bases) < LEAF_SHARE * len(surfaces) or num_places < AXES.least_leaves:
         return ()
     return (measure_stem(tube, bases, frame=frame, source="photos"),)
 

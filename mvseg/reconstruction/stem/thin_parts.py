@@ -121,8 +121,8 @@ def find_cells(views: Sequence[ThinView], points: Floats, axes: Floats) -> ThinC
 
 
 def share_of_views(views: Sequence[ThinView], points: Floats, size: float) -> Floats:
-    """(P,) mean over the views that see cells of this size about points (P, 3) of the surest pixel in each; 0 where
-    too few views see them."""
+    """(P,) mean over the views that see cells of this size about points (P, 3) of the surest pixel in each; NaN
+    where too few views see them."""
     total, count = np.zeros(len(points)), np.zeros(len(points))
     for view in views:
         cam = points @ view.px_from_world[:, :3].T + view.px_from_world[:, 3]
@@ -137,4 +137,4 @@ def share_of_views(views: Sequence[ThinView], points: Floats, size: float) -> Fl
         total += np.where(sees, pooled.ravel()[place], 0)
         count += sees
     enough = max(THIN.least_views, THIN.view_share * len(views))
-    return np.where(count >= enough, total / np.maximum(count, 1), 0)
+    return np.where(count >= enough, total / np.maximum(count, 1), np.nan)
