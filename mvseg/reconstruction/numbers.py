@@ -228,7 +228,7 @@ class TubeNumbers:
     taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
     sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
-    beside_px: float = 2.0  # chosen: distance beside the mask within which another instance may hide a part of its width
+    beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
     least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
     most_views: int = 12  # limit: views of a candidate that tell whether it is a stem
     least_views: int = 3  # limit: views that show the width of a place, for its changes to count
@@ -248,16 +248,18 @@ class AxisNumbers:
     lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured
     longest_petiole: float = 0.8  # chosen: length of a petiole, at most
     petiole_cost: float = 0.05  # chosen: distance from the axis that a longer petiole is worth, in its length
-    arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (angle between a petiole's chord and its end at the blade)
+    to_bases: float = 0.3  # chosen: how far the axis is drawn to the bases themselves
+    petiole_square: float = 0.1  # chosen: weight of squared lengths of petioles against distances of their rays
+    arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (of a petiole's chord to its end at the blade)
     near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
     near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
-    least_extent: float = 3.0  # chosen: distance between the outer nodes, in median distances of rays, at least
-    least_miss: float = 0.05  # chosen: median distance of rays, at least, for that
+    least_extent: float = 2.5  # chosen: distance between the outer nodes, in median petioles or misses, at least
+    least_miss: float = 0.05  # chosen: what counts as a petiole or a miss, at least
     tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
     bend_cost: float = 0.2  # chosen: weight against a bend
     beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths
     points: int = 40  # limit: points of an axis
-    ray_steps: int = 41  # limit: points of a ray
+    ray_steps: int = 17  # limit: points of a ray, and again between two of these
     rounds: int = 14  # limit: rounds of fitting the axis
     straight_rounds: int = 7  # limit: of these, with a straight one
 
@@ -295,6 +297,7 @@ class ThinNumbers:
     line_cells: float = 2.0  # chosen: distance from the line that has half the weight of none, in cells
     line_rounds: int = 6  # limit: rounds of fitting the line
     line_beyond: float = 0.6  # chosen: how far petioles may leave the line beyond its ends, in its length
+    cone: float = 0.12  # chosen: sine of the angle by which a stem may bend beyond its line
     bend_cost: float = 2.0  # chosen: weight against a bend of the line, in that of a cell
 
 

@@ -45,7 +45,9 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.traits.measure import Traits
 
 MOST_INSTANCES = 65534  # number of instances that a label image of 16 bits can hold
-READ_FILES = (DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "nodes.csv", "surfaces.npz", "voxels.npz")
+READ_FILES = (
+    DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "nodes.csv", "surfaces.npz", "voxels.npz"
+)  # fmt: skip
 Box = tuple[int, int, int, int]
 
 

@@ -22,7 +22,7 @@ from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import LEAF_TRAITS
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import find_stems
+from mvseg.traits.stems import find_stems, find_tubes
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
@@ -110,8 +110,14 @@ def measure_plant(
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
+    tubes = find_tubes(surfaces or {}, masks, scene.cameras) if config.leaves_only else {}
     rejected = find_rejected(
-        shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
+        shapes,
+        None if frame is None else frame[2],
+        config=config,
+        sure_views=sure_views,
+        visible_shares=visible,
+        stems={instance: each.probability for instance, each in tubes.items()},
     )
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     ground = 0.0  # heights start from the lowest point of all blades
@@ -119,7 +125,8 @@ def measure_plant(
         ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
     stems: tuple[Stem, ...] = ()
     if config.stems == "auto":
-        stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos)
+        seen = [tubes[instance].tube for instance, why in rejected.items() if why.kind == "stem"]
+        stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
     of_leaf = {node.leaf: node for stem in stems for node in stem.nodes}
     leaves = []
     for instance in instances:

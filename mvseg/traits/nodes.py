@@ -116,9 +116,8 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
     north = np.cross(tangents, east)
     azimuth = np.degrees(np.arctan2((across * north).sum(1), (across * east).sum(1)))
     axis_sd = MISS_SHARE * float(np.median(misses)) if len(misses) else 0.0
-    azimuth_sd = np.hypot(
-        np.degrees((np.hypot(axis_sd, bases.point_sd)) / np.maximum(np.linalg.norm(across, axis=1), 1e-12)), BLADE_SD_DEG
-    )
+    sideways = np.hypot(axis_sd, bases.point_sd) / np.maximum(np.linalg.norm(across, axis=1), 1e-12)
+    azimuth_sd = np.hypot(np.degrees(sideways), BLADE_SD_DEG)
     rising = np.degrees(np.arccos(np.clip((bases.ahead * tangents).sum(1), -1, 1)))
     slant = np.tan(np.radians(np.clip(rising, 5, 175)))
     turn_sd = np.hypot(np.radians(ARCH_SD_DEG), bases.angle_sd)
@@ -189,7 +188,9 @@ def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:
     single = _gap_evidence(np.diff(height))
     turns = np.arange(len(nodes))
     spirals = np.array([
-        np.logaddexp(*(_log_mean(_log_normal(azimuth - START_DEG - way * angle * turns, sd).sum(1)) for way in (-1, 1)))
+        np.logaddexp.reduce([
+            _log_mean(_log_normal(azimuth - START_DEG - way * angle * turns, sd).sum(1)) for way in (-1, 1)
+        ])
         for angle in SPIRAL_DEG
     ])  # fmt: skip
     pairs = [_pair_azimuths(azimuth, sd, first) + _pair_gaps(height, height_sd, first) for first in (0, 1)]
@@ -224,11 +225,9 @@ def _pair_azimuths(azimuth: Floats, sd: Floats, first: int) -> float:
     for number in np.unique(pair):
         members = np.flatnonzero(pair == number)
         start = START_DEG[:, 0] + 90 * number
-        orders = [
-            sum(_log_normal(azimuth[leaf] - start - 180 * (place ^ swap), sd[leaf]) for place, leaf in enumerate(members))
-            for swap in (0, 1)
-        ]  # fmt: skip
-        total += np.logaddexp(*orders) - np.log(2)
+        sides = 180 * np.arange(len(members))
+        orders = [_log_normal(azimuth[members] - start[:, None] - sides - swap, sd[members]) for swap in (0, 180)]
+        total += np.logaddexp(*(each.sum(1) for each in orders)) - np.log(2)
     return _log_mean(total)
 
 

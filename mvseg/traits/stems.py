@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.numbers import AXES
+from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.stem.leaf_bases import (
     BaseAxis,
     LeafBases,
@@ -24,12 +24,15 @@ from mvseg.reconstruction.stem.leaf_bases import (
 )
 from mvseg.reconstruction.stem.stem_path import StemPath, find_path
 from mvseg.reconstruction.stem.thin_parts import ThinCells, ThinView, find_cells, see_thin, share_of_views
+from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.traits.nodes import Stem, measure_stem
 
 Floats = NDArray[np.float64]
 
+LONG = 4.0  # chosen: length over width of a surface from which it may be a stem's
 MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
 LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
 MOST_GAP = 8.5  # chosen: longest step in a petiole that was traced, in cells
@@ -40,13 +43,26 @@ FAINTEST = 0.25  # chosen: part of an axis that views need not show
 LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
 
 
+def find_tubes(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras) -> dict[int, TubeEvidence]:
+    """{instance id: evidence that it is a stem} of those that are long enough to be one."""
+    long = {instance: each for instance, each in surfaces.items() if each.exists and each.length > LONG * each.width}
+    return tube_evidence(masks.regions, masks.instance_ids, cameras, surfaces=long)
+
+
 def find_stems(
-    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, frame: Floats | None, photos: Photos
+    surfaces: Mapping[int, LeafSurface],
+    masks: Masks,
+    cameras: Cameras,
+    *,
+    frame: Floats | None,
+    photos: Photos,
+    tubes: Sequence[Tube] = (),
 ) -> tuple[Stem, ...]:
     """Find the stems that the leaves of a plant sit on, and their nodes.
 
-    Leaves point back to them. Where photos exist, they must show something thin there. Where leaves point to no stem, as
-    those that are wider than long, the cheapest path through thin parts between them is one.
+    Masks that show stems tell best. Otherwise leaves point back to them; where photos exist, these must show something
+    thin there. Where leaves point to no stem, as those that are wider than long, the cheapest path through thin parts
+    between them is one.
 
     Args:
         surfaces: {instance id: credible surface} of leaves.
@@ -54,6 +70,7 @@ def find_stems(
         cameras: V cameras.
         frame: (3, 3) rows east, north, up; None: up is not known.
         photos: used, if they exist.
+        tubes: fitted to masks of stems.
 
     Returns:
         The stems, that of the most leaves first; none where leaves and views do not agree about one.
@@ -61,6 +78,8 @@ def find_stems(
     if not surfaces:
         return ()
     upward = find_upward(cameras) if frame is None else frame[2]
+    if tubes and (found := _of_tubes(tubes, surfaces, frame, upward)):
+        return found
     axes = axes_of_bases(surfaces, upward)
     if not photos.exist:
         return _of_bases(axes, frame)
@@ -117,6 +136,34 @@ def see_plant(
         views.append(see_thin(photos(view), is_leaf.cpu().numpy(), px_from_world[view], points))
     axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
     return SeenPlant(tuple(views), find_cells(views, points, axes), leaves)
+
+
+def _of_tubes(
+    tubes: Sequence[Tube], surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
+) -> tuple[Stem, ...]:
+    """The stems that masks show, each with the leaves that point back to it rather than to another one."""
+    ends, others = find_ends(surfaces)
+    size = float(np.median(ends.lengths))
+    upright = [tube.reverse() if _is_reversed(tube, upward, ends) else tube for tube in tubes]
+    nearer = [choose_ends(ends, others, curve_of(tube)) for tube in upright]
+    gaps = np.array([project_bases(bases, curve_of(tube))[1] for bases, tube in zip(nearer, upright, strict=True)])
+    of_leaf = np.where(gaps.min(0) < AXES.near * size, gaps.argmin(0), -1)
+    own = [bases.select(of_leaf == number) for number, bases in enumerate(nearer)]
+    found = sorted(zip(upright, own, strict=True), key=lambda each: -len(each[1]))
+    return tuple(
+        measure_stem(tube, bases, frame=frame, source="masks", number=number)
+        for number, (tube, bases) in enumerate(found, start=1)
+        if len(bases)
+    )
+
+
+def _is_reversed(tube: Tube, upward: Floats | None, leaves: LeafBases) -> bool:
+    """Does a tube lead downwards, or, where up is not known, away from most leaves?"""
+    first, last = tube.points()[[0, -1]]
+    if upward is not None:
+        return bool((last - first) @ upward < 0)
+    below, above = (float(np.median(np.linalg.norm(leaves.points - end, axis=1))) for end in (first, last))
+    return below < above
 
 
 def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None) -> tuple[Stem, ...]:

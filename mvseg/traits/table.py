@@ -96,7 +96,8 @@ def read_nodes(path: Path) -> tuple[Stem, ...]:
                 name: Measurement(_number(row[name]), _number(row[f"{name}_sd"]), row["source"])
                 for name in NODE_NUMBERS
             }
-            place, base = ((_number(row[f"{of}x"]), _number(row[f"{of}y"]), _number(row[f"{of}z"])) for of in ("", "base_"))
+            place = _number(row["x"]), _number(row["y"]), _number(row["z"])
+            base = _number(row["base_x"]), _number(row["base_y"]), _number(row["base_z"])
             stem, number, leaf = (int(row[name]) for name in ("stem", "node", "leaf"))
             nodes.setdefault(stem, []).append(Node(number=number, leaf=leaf, place=place, base=base, **numbers))
             angle, probability = _number(row["phyllotaxis_angle"]), _number(row["phyllotaxis_probability"])

@@ -206,7 +206,8 @@ def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats)
     px = seen.px.copy()
     px[:, ENDS] = _tips(seen, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
     ribbon = np.stack([px - half, px, px + half], 2)
-    drawn = draw_patch(masks, Projection(ribbon, np.repeat(seen.depth[..., None], 3, 2)), offsets=offsets, is_blurred=False)
+    projection = Projection(ribbon, np.repeat(seen.depth[..., None], 3, 2))
+    drawn = draw_patch(masks, projection, offsets=offsets, is_blurred=False)
     return crop_ious(masks, drawn >= 0.5)
 
 

@@ -126,16 +126,18 @@ def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tup
 
 def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAxis | None:
     """The axis of the most leaves, of which `first` and `second` are both ends; None where these are too few, or their
-    nodes lie no farther apart along it than their rays miss it."""
+    nodes lie hardly farther apart along it than their petioles are long."""
     size = float(np.median(first.lengths))
     starts = _start_lines(first, second, up, size=size)
     found = [_fit_axis(first, second, start, size=size) for start in starts]
-    points, bases, distances, along = min(found, key=lambda each: _cost(each[2], size))
+    costs = [_cost(bases, nodes, distances, size) for _, bases, nodes, distances, _ in found]
+    points, bases, nodes, distances, along = found[int(np.argmin(costs))]
     is_near = distances < AXES.near * size
     if is_near.sum() < (AXES.least_leaves if is_near.mean() >= AXES.near_share else AXES.least_of_many):
         return None
-    extent = float(np.ptp(along[is_near]))
-    if extent < AXES.least_extent * max(float(np.median(distances[is_near])), AXES.least_miss * size):
+    petioles = np.linalg.norm(bases.points - nodes, axis=1)
+    width = max(*(float(np.median(each[is_near])) for each in (distances, petioles)), AXES.least_miss * size)
+    if float(np.ptp(along[is_near])) < AXES.least_extent * width:
         return None
     rising = bases.ahead[is_near].sum(0) if up is None else up
     tube = as_tube(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1], distances[is_near])
@@ -170,20 +172,20 @@ def _start_lines(
     costs = []
     for point, direction in lines:
         ahead = direction / np.linalg.norm(direction)
-        gaps = [_line_gaps(ends, point, ahead) for ends in (first, second)]
-        costs.append(_cost(np.minimum(*gaps), size))
+        costs.append(float(np.minimum(*(_line_costs(ends, point, ahead, size) for ends in (first, second))).sum()))
     best = np.argsort(costs, kind="stable")[: AXES.most_starts]
     return [lines[index] for index in best.tolist()]
 
 
-def _line_gaps(bases: LeafBases, point: Floats, ahead: Floats) -> Floats:
-    """(N,) how far the rays back from bases pass a line, no longer than petioles are, where length costs a little."""
+def _line_costs(bases: LeafBases, point: Floats, ahead: Floats, size: float) -> Floats:
+    """(N,) the `_cost` of a line for each leaf, of rays that are no longer than petioles are."""
     away = bases.points - point
     away = away - (away @ ahead)[:, None] * ahead
     back = -bases.ahead + (bases.ahead @ ahead)[:, None] * ahead
     t = -(away * back).sum(1) / np.maximum((back**2).sum(1), 1e-12)
     t = np.clip(t, 0, AXES.longest_petiole * bases.lengths)
-    return np.asarray(np.linalg.norm(away + t[:, None] * back, axis=1) + AXES.petiole_cost * t)
+    squares = ((away + t[:, None] * back) ** 2).sum(1) / (AXES.near * size) ** 2
+    return np.asarray(squares / (1 + squares) + AXES.petiole_square * (t / bases.lengths) ** 2)
 
 
 def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
@@ -193,19 +195,24 @@ def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
     return np.asarray(origin + np.linalg.pinv(across.sum(0), rcond=1e-9) @ target)
 
 
-def _cost(distances: Floats, size: float) -> float:
-    """Robust sum of distances, in leaf lengths."""
+def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> float:
+    """How badly an axis suits: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3).
+
+    Leaves in two rows point to any line between these: petioles are alike on both sides.
+    """
     squares = (distances / (AXES.near * size)) ** 2
-    return float((squares / (1 + squares)).sum())
+    petioles = np.linalg.norm(bases.points - nodes, axis=1) / bases.lengths
+    return float((squares / (1 + squares) + AXES.petiole_square * petioles**2).sum())
 
 
 def _fit_axis(
     first: LeafBases, second: LeafBases, line: tuple[Floats, Floats], *, size: float
-) -> tuple[Floats, LeafBases, Floats, Floats]:
+) -> tuple[Floats, LeafBases, Floats, Floats, Floats]:
     """Rounds of: which end is the base, where its ray is nearest to the curve, and the curve through these places.
 
     Returns:
-        (P, 3) points of the curve, the bases, their rays' distances (N,) from it and places (N,) along it.
+        (P, 3) points of the curve, the bases, their nodes (N, 3), their rays' distances (N,) from the curve and places
+        (N,) along it.
     """
     middle, direction = line
     direction = direction / np.linalg.norm(direction)
@@ -224,21 +231,22 @@ def _fit_axis(
         rows = np.stack([t**power for power in range(degree + 1)], 1)
         # A bend, and a tilt of few leaves, must be worth it.
         prior = np.diag([0.0, AXES.tilt_cost, AXES.bend_cost][: degree + 1]) * size
-        deviations = nodes - (curve[0] + place[:, None] * chord)
+        # Leaves in two rows point to any line between these: the middle of their bases is the likely one.
+        targets = nodes + AXES.to_bases * (bases.points - nodes)
+        deviations = targets - (curve[0] + place[:, None] * chord)
         system = (rows.T * weight) @ rows + prior / size
         offset = np.linalg.solve(system, (rows.T * weight) @ deviations)
-        ends = np.array([t.min() - AXES.beyond, t.max() + AXES.beyond])
-        even = np.linspace(*ends, AXES.points)
+        even = np.linspace(float(t.min()) - AXES.beyond, float(t.max()) + AXES.beyond, AXES.points)
         curve = curve[0] + (even * scale + place.mean())[:, None] * chord
         curve = curve + np.stack([even**power for power in range(degree + 1)], 1) @ offset
     bases = choose_ends(first, second, curve)
-    _, distances, along = project_bases(bases, curve)
+    nodes, distances, along = project_bases(bases, curve)
     near = distances < AXES.near * size
     if near.sum() >= 2:  # from the lowest node to the highest one
-        reach = np.append(0, np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum())
+        places = np.append(0, np.linalg.norm(np.diff(curve, axis=0), axis=1).cumsum())
         keep = np.linspace(along[near].min(), along[near].max(), AXES.points)
-        curve = np.stack([np.interp(keep, reach, axis) for axis in curve.T], 1)
-    return curve, bases, distances, along
+        curve = np.stack([np.interp(keep, places, axis) for axis in curve.T], 1)
+    return curve, bases, nodes, distances, along
 
 
 def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
@@ -269,7 +277,19 @@ def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floa
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
     turn = np.radians(AXES.arch_deg)
     back = np.cos(turn) * back - np.sin(turn) * level
-    t = np.linspace(0, AXES.longest_petiole, AXES.ray_steps)
+    step = AXES.longest_petiole / (AXES.ray_steps - 1)
+    t = np.tile(step * np.arange(AXES.ray_steps), (len(bases), 1))
+    rough, _, _ = _nearest_on_rays(bases, back, curve, t)
+    fine = rough[:, None] + step * np.linspace(-1, 1, AXES.ray_steps)
+    t, gap, along = _nearest_on_rays(bases, back, curve, np.clip(fine, 0, AXES.longest_petiole))
+    return bases.points + (t * bases.lengths)[:, None] * back, gap, along
+
+
+def _nearest_on_rays(
+    bases: LeafBases, back: Floats, curve: Floats, t: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Of places t (N, R) on rays, in lengths of the leaves, the one (N,) that is nearest to a curve (P, 3), with its
+    distance (N,) and its place (N,) along the curve."""
     rays = bases.points[:, None] + (t * bases.lengths[:, None])[..., None] * back[:, None]
     starts, steps = curve[:-1], np.diff(curve, axis=0)
     size = np.maximum((steps**2).sum(1), 1e-300)
@@ -283,7 +303,7 @@ def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floa
     piece = piece[rows, best]
     reach = np.append(0, np.sqrt(size).cumsum())
     along = reach[piece] + share[rows, best, piece] * np.sqrt(size[piece])
-    return rays[rows, best], gap[rows, best], along
+    return t[rows, best], gap[rows, best], along
 
 
 def curve_of(tube: Tube) -> Floats:

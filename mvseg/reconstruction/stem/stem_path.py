@@ -122,10 +122,13 @@ def _find_petioles(
     graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats
 ) -> dict[int, Floats]:
     """{leaf: (n, 3) the cheapest path from the line, or from where it goes on beyond its ends, to the leaf}."""
-    beyond = [end + np.linspace(0, THIN.line_beyond, AXES.points)[1:, None] * (end - inner) / np.linalg.norm(end - inner)
-              * np.linalg.norm(line[-1] - line[0]) for end, inner in ((line[0], line[3]), (line[-1], line[-4]))]  # fmt: skip
-    gap, _ = cKDTree(np.concatenate([line, *beyond])).query(cells.points)
-    sources = np.flatnonzero(gap < THIN.line_cells * cells.size)
+    ends = np.array([[line[0], line[3]], [line[-1], line[-4]]])
+    ahead = ends[:, 0] - ends[:, 1]
+    ahead *= THIN.line_beyond * np.linalg.norm(line[-1] - line[0]) / np.linalg.norm(ahead, axis=1, keepdims=True)
+    beyond = ends[:, 0] + np.linspace(0, 1, AXES.points)[1:, None, None] * ahead
+    gap, place = cKDTree(np.concatenate([line, beyond.reshape(-1, 3)])).query(cells.points)
+    away = np.linalg.norm(np.concatenate([line * 0, np.abs(beyond - ends[:, 0]).reshape(-1, 3)]), axis=1)[place]
+    sources = np.flatnonzero(gap < THIN.line_cells * cells.size + THIN.cone * away)  # the stem may bend there
     if not len(sources):
         return {}
     cost, before, _ = dijkstra(
