@@ -208,6 +208,8 @@ class StemNumbers:
 class TubeNumbers:
     """Tubes that are fitted to masks of stems, and what tells stems from leaves."""
 
+    mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
+    difference: float = 1e-4  # limit: of u, for the directions of a cubic
     rows: int = 24  # limit: places along a tube at which it is compared with its masks
     patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
     num_steps: int = 12  # limit: steps of the fit

@@ -124,7 +124,7 @@ def share_of_views(views: Sequence[ThinView], points: Floats, size: float) -> Fl
     """(P,) mean over the views that see cells of this size about points (P, 3) of the surest pixel in each; NaN
     where too few views see them."""
     total, count = np.zeros(len(points)), np.zeros(len(points))
-    for view in views:
+    for view in views if len(points) else ():
         cam = points @ view.px_from_world[:, :3].T + view.px_from_world[:, 3]
         depth = np.maximum(cam[:, 2], 1e-9)
         x, y = (cam[:, axis] / depth for axis in (0, 1))

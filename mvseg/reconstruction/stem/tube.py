@@ -7,17 +7,18 @@ coefficients. Both are linear in their coefficients, as leaf patches are.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.numbers import TUBE
 from mvseg.reconstruction.surface.leaf_patch import Floats, spline_basis
 
-AXIS, RADIUS = 6, 3  # coefficients of the axis, vectors, and of the radius (a definition)
-NUM_ROWS = 32  # places along a tube that is measured or drawn (a definition)
-NUM_SIDES = 12  # sides of the mesh of a tube (a definition)
+COUNTS = (6, 3)  # coefficients of the axis, vectors, and of the radius (a definition)
+AXIS, RADIUS = COUNTS
+NUM_ROWS, NUM_SIDES = TUBE.mesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,15 +116,9 @@ def tube_places(count: int) -> Floats:
     return np.linspace(0, 1, count)
 
 
-@cache
-def _slope_step() -> float:
-    return 1e-4  # of u, for differences of a cubic
-
-
 def axis_slopes(u: Floats) -> Floats:
     """(P, 6) rows that give dx/du of the axis at places u (P,)."""
-    step = _slope_step()
-    low, high = np.clip(u - step, 0, 1), np.clip(u + step, 0, 1)
+    low, high = np.clip(u - TUBE.difference, 0, 1), np.clip(u + TUBE.difference, 0, 1)
     slopes: Floats = (spline_basis(high, AXIS) - spline_basis(low, AXIS)) / (high - low)[:, None]
     return slopes
 
