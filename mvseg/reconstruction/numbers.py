@@ -250,13 +250,15 @@ class AxisNumbers:
     lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured
     longest_petiole: float = 0.8  # chosen: length of a petiole, at most
     petiole_cost: float = 0.05  # chosen: distance from the axis that a longer petiole is worth, in its length
-    to_bases: float = 0.3  # chosen: how far the axis is drawn to the bases themselves
+    least_petiole: float = 0.01  # limit: length of a petiole below which the axis may not go on along its ray
+    to_bases: float = 0.05  # chosen: weight of the distance of the axis along a ray, where that beside it is 1
     petiole_square: float = 0.1  # chosen: weight of squared lengths of petioles against distances of their rays
     arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (of a petiole's chord to its end at the blade)
     near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
     near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
     least_extent: float = 2.5  # chosen: distance between the outer nodes, in median petioles or misses, at least
     least_miss: float = 0.05  # chosen: what counts as a petiole or a miss, at least
+    lean_cost: float = 1.0  # chosen: cost of a level axis for each leaf, where that of a leaf that points beside it is 1
     tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
     bend_cost: float = 0.2  # chosen: weight against a bend
     beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths

@@ -130,7 +130,10 @@ def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAx
     size = float(np.median(first.lengths))
     starts = _start_lines(first, second, up, size=size)
     found = [_fit_axis(first, second, start, size=size) for start in starts]
-    costs = [_cost(bases, nodes, distances, size) for _, bases, nodes, distances, _ in found]
+    costs = [
+        _cost(bases, nodes, distances, size) + _lean_cost(points[-1] - points[0], up, len(bases))
+        for points, bases, nodes, distances, _ in found
+    ]
     points, bases, nodes, distances, along = found[int(np.argmin(costs))]
     is_near = distances < AXES.near * size
     if is_near.sum() < (AXES.least_leaves if is_near.mean() >= AXES.near_share else AXES.least_of_many):
@@ -172,7 +175,8 @@ def _start_lines(
     costs = []
     for point, direction in lines:
         ahead = direction / np.linalg.norm(direction)
-        costs.append(float(np.minimum(*(_line_costs(ends, point, ahead, size) for ends in (first, second))).sum()))
+        either_end = np.minimum(*(_line_costs(ends, point, ahead, size) for ends in (first, second)))
+        costs.append(float(either_end.sum()) + _lean_cost(ahead, up, len(bases)))
     best = np.argsort(costs, kind="stable")[: AXES.most_starts]
     return [lines[index] for index in best.tolist()]
 
@@ -205,6 +209,14 @@ def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> fl
     return float((squares / (1 + squares) + AXES.petiole_square * petioles**2).sum())
 
 
+def _lean_cost(ahead: Floats, up: Floats | None, num_leaves: int) -> float:
+    """What an axis along a direction (3,) costs that leans: leaves of two stems also point to lines across both."""
+    if up is None:
+        return 0.0
+    cosine = float(ahead @ up) / max(float(np.linalg.norm(ahead)), 1e-300)
+    return AXES.lean_cost * num_leaves * (1 - cosine**2)
+
+
 def _fit_axis(
     first: LeafBases, second: LeafBases, line: tuple[Floats, Floats], *, size: float
 ) -> tuple[Floats, LeafBases, Floats, Floats, Floats]:
@@ -230,12 +242,18 @@ def _fit_axis(
         t = (place - place.mean()) / scale
         rows = np.stack([t**power for power in range(degree + 1)], 1)
         # A bend, and a tilt of few leaves, must be worth it.
-        prior = np.diag([0.0, AXES.tilt_cost, AXES.bend_cost][: degree + 1]) * size
-        # Leaves in two rows point to any line between these: the middle of their bases is the likely one.
-        targets = nodes + AXES.to_bases * (bases.points - nodes)
-        deviations = targets - (curve[0] + place[:, None] * chord)
-        system = (rows.T * weight) @ rows + prior / size
-        offset = np.linalg.solve(system, (rows.T * weight) @ deviations)
+        prior = np.diag([0.0, AXES.tilt_cost, AXES.bend_cost][: degree + 1])
+        petiole = np.linalg.norm(bases.points - nodes, axis=1) / bases.lengths
+        is_free = (petiole > AXES.least_petiole) & (petiole < AXES.longest_petiole - AXES.least_petiole)
+        back = _look_back(bases, curve)
+        # The axis may be anywhere along a ray, but not beside it. Leaves in two rows point to any line between these:
+        # the middle of their bases is the likely one.
+        along_ray = back[:, :, None] * back[:, None] * np.where(is_free, 1 - AXES.to_bases, 0)[:, None, None]
+        across = weight[:, None, None] * (np.eye(3) - along_ray)
+        targets = np.where(is_free[:, None], bases.points, nodes) - (curve[0] + place[:, None] * chord)
+        system = np.einsum("np,nij,nq->piqj", rows, across, rows).reshape(3 * degree + 3, -1)
+        right = np.einsum("np,nij,nj->pi", rows, across, targets).ravel()
+        offset = np.linalg.solve(system + np.kron(prior, np.eye(3)), right).reshape(degree + 1, 3)
         even = np.linspace(float(t.min()) - AXES.beyond, float(t.max()) + AXES.beyond, AXES.points)
         curve = curve[0] + (even * scale + place.mean())[:, None] * chord
         curve = curve + np.stack([even**power for power in range(degree + 1)], 1) @ offset
@@ -270,19 +288,24 @@ def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floa
         (N, 3) the points of the rays that are nearest to the curve, where length costs a little, (N,) their distances,
         and (N,) how far along the curve they are.
     """
-    upwards = curve[-1] - curve[0]
-    upwards = upwards / max(float(np.linalg.norm(upwards)), 1e-300)
-    back = -bases.ahead
-    level = upwards - (back @ upwards)[:, None] * back
-    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
-    turn = np.radians(AXES.arch_deg)
-    back = np.cos(turn) * back - np.sin(turn) * level
+    back = _look_back(bases, curve)
     step = AXES.longest_petiole / (AXES.ray_steps - 1)
     t = np.tile(step * np.arange(AXES.ray_steps), (len(bases), 1))
     rough, _, _ = _nearest_on_rays(bases, back, curve, t)
     fine = rough[:, None] + step * np.linspace(-1, 1, AXES.ray_steps)
     t, gap, along = _nearest_on_rays(bases, back, curve, np.clip(fine, 0, AXES.longest_petiole))
     return bases.points + (t * bases.lengths)[:, None] * back, gap, along
+
+
+def _look_back(bases: LeafBases, curve: Floats) -> Floats:
+    """(N, 3) unit vectors of rays from bases back to where petioles come from, of a curve (P, 3) that leads upwards."""
+    upwards = curve[-1] - curve[0]
+    upwards = upwards / max(float(np.linalg.norm(upwards)), 1e-300)
+    back = -bases.ahead
+    level = upwards - (back @ upwards)[:, None] * back
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
+    turn = np.radians(AXES.arch_deg)
+    return np.asarray(np.cos(turn) * back - np.sin(turn) * level)
 
 
 def _nearest_on_rays(

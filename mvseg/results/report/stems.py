@@ -40,12 +40,7 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
         nodes = [
-            {
-                "leaf": node.leaf,
-                "height": _rounded(node.height.value),
-                "heightSd": _rounded(node.height.sd),
-                "azimuth": _rounded(node.azimuth.value),
-            }
+            {"leaf": node.leaf, "height": _rounded(node.height.value), "azimuth": _rounded(node.azimuth.value)}
             for node in stem.nodes
         ]
         about: dict[str, Any] = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
@@ -57,5 +52,5 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     return found
 
 
-def _rounded(value: float) -> float | None:
-    return float(format_number(value)) if np.isfinite(value) else None
+def _rounded(value: float) -> float:
+    return float(format_number(value))
