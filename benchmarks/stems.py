@@ -113,7 +113,7 @@ def summarise(rows: list[dict[str, Any]]) -> str:
 def part_maps(plant: Plant, cameras: Cameras) -> list[np.ndarray]:
     """V label maps of leaves, and after them of the stems, without petioles."""
     mesh, num = merge_meshes(plant), len(plant.leaves) + len(plant.stems)
-    faces = [len(each.faces) for each in (*plant.leaves, *plant.parts)]
+    faces = [len(leaf.faces) for leaf in plant.leaves] + [len(part.faces) for part in plant.parts]
     owner = np.repeat(np.arange(1, len(faces) + 1), faces)
     owner[owner > num] = 0
     bvh, maps = build_bvh(mesh), []
@@ -168,11 +168,11 @@ def print_evidence(num_plants: int) -> None:
     ])  # fmt: skip
     features[:, 2] = np.log(features[:, 2])
     is_stem = np.array([row["is_stem"] for row in rows if np.isfinite(row["gain"])])
-    sign, share = np.where(is_stem, 1, -1), np.where(is_stem, 0.5 / is_stem.mean(), 0.5 / (1 - is_stem.mean()))
+    side, share = np.where(is_stem, 1, -1), np.where(is_stem, 0.5 / is_stem.mean(), 0.5 / (1 - is_stem.mean()))
     spread = features.std(0)
 
     def loss(weights: np.ndarray) -> float:
-        misses = share * np.logaddexp(0, -sign * (features @ weights))
+        misses = share * np.logaddexp(0, -side * (features @ weights))
         return float(misses.sum() + 0.1 * ((weights * spread) ** 2).sum())
 
     print("weights:", np.round(minimize(loss, np.zeros(4)).x, 2).tolist())

@@ -126,6 +126,9 @@ def _compare_traits(first: Traits, second: Traits, numbers: Mapping[int, int], r
     from mvseg.traits.table import VOXEL_NAMES
 
     _check("unit of the traits", first.unit, second.unit)
+    nodes = [[(stem.source, [numbers.get(node.leaf, node.leaf) for node in stem.nodes]) for stem in first.stems],
+             [(stem.source, [node.leaf for node in stem.nodes]) for stem in second.stems]]  # fmt: skip
+    _check("nodes of the stems", *nodes)
     tables = {"the plant": (first.whole, second.whole)}
     leaves, again = ({leaf.leaf: leaf for leaf in each.leaves} for each in (first, second))
     for number, (one, other) in _pair_up("traits", leaves, again, numbers).items():

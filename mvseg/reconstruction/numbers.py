@@ -258,7 +258,7 @@ class AxisNumbers:
     near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
     least_extent: float = 2.5  # chosen: distance between the outer nodes, in median petioles or misses, at least
     least_miss: float = 0.05  # chosen: what counts as a petiole or a miss, at least
-    lean_cost: float = 1.0  # chosen: cost of a level axis for each leaf, where that of a leaf that points beside it is 1
+    lean_cost: float = 1.0  # chosen: cost of a level axis per leaf, where that of a leaf that misses it is 1
     tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
     bend_cost: float = 0.2  # chosen: weight against a bend
     beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mvseg.reconstruction.stem.leaf_bases import LeafBases, as_tube, curve_of, project_bases
 from mvseg.reconstruction.stem.tube import Tube
-from mvseg.traits.leaf import Measurement, missing, wrap_azimuth
+from mvseg.traits.leaf import VAGUE_DEG, Measurement, missing, wrap_azimuth
 
 Floats = NDArray[np.float64]
 
@@ -24,6 +24,7 @@ START_DEG = np.arange(0.0, 360.0, 4.0)[:, None]  # limit: azimuths of the lowest
 SPIRAL_DEG = np.arange(100.0, 165.0, 2.5)  # definition: divergence angles that count as a spiral
 LEAST_NODES = 4  # limit: leaves that suggest a phyllotaxis
 
+VAGUE = missing("not measured: the leaf begins at the stem, and points along it")
 FIRST_NODE = missing("not measured: the lowest node has none below")
 
 
@@ -135,7 +136,8 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
             sd = float(np.hypot(height_sd[leaf], height_sd[below]))
             internode = Measurement(float(along[leaf] - along[below]), sd, source)
             sd = float(np.hypot(azimuth_sd[leaf], azimuth_sd[below]))
-            divergence = Measurement(_apart(azimuth[leaf], azimuth[below]), sd, source)
+            divergence = Measurement(_apart(azimuth[leaf], azimuth[below]), sd, source) if sd <= VAGUE_DEG else VAGUE
+        turned = Measurement(wrap_azimuth(float(azimuth[leaf])), float(azimuth_sd[leaf]), source)
         x, y, z = on_axis[leaf].tolist()
         bx, by, bz = bases.points[leaf].tolist()
         nodes.append(
@@ -148,7 +150,7 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
                 internode=internode,
                 divergence=divergence,
                 insertion_angle=Measurement(float(rising[leaf]), float(angle_sd[leaf]), source),
-                azimuth=Measurement(wrap_azimuth(float(azimuth[leaf])), float(azimuth_sd[leaf]), source),
+                azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
             )
         )
     return Stem(number=number, tube=tube, source=source, nodes=tuple(nodes), phyllotaxis=suggest_phyllotaxis(nodes))
@@ -181,8 +183,8 @@ def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:
     """
     if len(nodes) < LEAST_NODES:
         return UNCLEAR
-    azimuth = np.array([node.azimuth.value for node in nodes])
-    sd = np.hypot([node.azimuth.sd for node in nodes], JITTER_DEG)
+    azimuth = np.array([node.azimuth.value if node.azimuth.exists else 0.0 for node in nodes])
+    sd = np.hypot([node.azimuth.sd if node.azimuth.exists else 180.0 for node in nodes], JITTER_DEG)
     height = np.array([node.height.value for node in nodes])
     height_sd = np.array([node.height.sd for node in nodes])
     single = _gap_evidence(np.diff(height))

@@ -217,3 +217,14 @@ def test_a_path_through_thin_parts_joins_leaves_to_their_stem() -> None:
     nothing = [see_thin(np.full((SIZE, SIZE, 3), 150, np.uint8), np.zeros((SIZE, SIZE), bool), matrix, points)
                for matrix in cameras.px_from_world.numpy()]  # fmt: skip
     assert find_path(find_cells(nothing, points, np.eye(3)), leaves) is None
+
+
+def test_a_leaf_along_its_stem_has_no_azimuth_but_a_height() -> None:
+    leaves = dict(PLANTS["spiral"][1])
+    leaves[11] = move(bent_blade(bend_deg=1.0), turn_about(np.array([0, -1.0, 0]), 90), shift=(0.01, 0, 150))
+    (stem,) = stems_of(leaves)
+    top = next(node for node in stem.nodes if node.leaf == 11)
+    assert top.height.exists
+    assert not top.azimuth.exists
+    assert not top.divergence.exists
+    assert stem.phyllotaxis.name in ("spiral", "unclear")

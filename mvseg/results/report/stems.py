@@ -52,5 +52,5 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     return found
 
 
-def _rounded(value: float) -> float:
-    return float(format_number(value))
+def _rounded(value: float) -> float | None:
+    return float(format_number(value)) if np.isfinite(value) else None

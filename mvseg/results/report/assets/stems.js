@@ -21,7 +21,7 @@ function describeStem(stem, data) {
 
 function drawNodes(nodes, data, title) {
   const highest = Math.max(...nodes.map((node) => node.height), 1e-12);
-  const at = ({ azimuth, height }) => [30 + (azimuth / 360) * 260, 210 - (height / highest) * 190];
+  const at = ({ azimuth, height }) => [30 + ((azimuth ?? 0) / 360) * 260, 210 - (height / highest) * 190];
   const picture = drawing("svg", { class: "nodes", viewBox: "0 0 320 240", role: "img", "aria-label": title });
   const write = (x, y, text) => picture.append(drawing("text", { x, y }, `${text}`));
   for (const azimuth of [0, 90, 180, 270]) write(at({ azimuth, height: 0 })[0], 235, `${azimuth}°`);
