@@ -128,6 +128,8 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
     )  # fmt: skip
     angle_sd = np.hypot(np.degrees(turn_sd), ARCH_SD_DEG)
     order = np.lexsort((bases.ids, along))
+    # Where heights start from the lowest node, its error is in all of them.
+    start_sd = float(height_sd[order[0]]) if len(order) and source != "masks" else 0.0
     nodes: list[Node] = []
     for rank, leaf in enumerate(order.tolist()):
         below = order[rank - 1] if rank else None
@@ -146,7 +148,7 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
                 leaf=int(bases.ids[leaf]),
                 place=(x, y, z),
                 base=(bx, by, bz),
-                height=Measurement(float(along[leaf]) - foot, float(height_sd[leaf]), source),
+                height=Measurement(float(along[leaf]) - foot, float(np.hypot(height_sd[leaf], start_sd)), source),
                 internode=internode,
                 divergence=divergence,
                 insertion_angle=Measurement(float(rising[leaf]), float(angle_sd[leaf]), source),

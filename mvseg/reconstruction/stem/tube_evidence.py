@@ -86,6 +86,8 @@ def tube_evidence(
     Returns:
         {instance id: evidence} of those that have a surface.
     """
+    if not any(surface.exists for surface in surfaces.values()):
+        return {}
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = instance_frames(regions, instance_ids, cameras)
     offsets = [each.offsets_px[each.offsets_px.isfinite()].numpy() for each in surfaces.values() if each.exists]
