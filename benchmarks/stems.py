@@ -168,11 +168,10 @@ def print_evidence(num_plants: int) -> None:
     ])  # fmt: skip
     features[:, 2] = np.log(features[:, 2])
     is_stem = np.array([row["is_stem"] for row in rows if np.isfinite(row["gain"])])
-    side, share = np.where(is_stem, 1, -1), np.where(is_stem, 0.5 / is_stem.mean(), 0.5 / (1 - is_stem.mean()))
-    spread = features.std(0)
+    side, spread = np.where(is_stem, 1, -1), features.std(0)
 
     def loss(weights: np.ndarray) -> float:
-        misses = share * np.logaddexp(0, -side * (features @ weights))
+        misses = np.logaddexp(0, -side * (features @ weights))
         return float(misses.sum() + 0.1 * ((weights * spread) ** 2).sum())
 
     print("weights:", np.round(minimize(loss, np.zeros(4)).x, 2).tolist())

@@ -94,7 +94,7 @@ def find_stems(
 
 
 def find_upward(cameras: Cameras) -> Floats | None:
-    """(3,) the direction that is up in most photos, which is roughly up for the plant; None where these do not agree."""
+    """(3,) the direction that is up in most photos, roughly that of the plant; None where these do not agree."""
     mean = -cameras.R[:, 1].mean(0).cpu().numpy()
     return mean / np.linalg.norm(mean) if np.linalg.norm(mean) > UPRIGHT else None
 

@@ -25,7 +25,7 @@ from mvseg.reconstruction.surface.patch_image import view_ious
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-# fitted: python benchmarks/stems.py --cache DIR --evidence; of gain, width change, logarithm of the aspect, and 1
+# fitted: python benchmarks/stems.py --cache DIR --plants 2 --evidence; of gain, width change, logarithm of the aspect, and 1
 WEIGHTS = (31.4, -6.4, 1.39, -3.3)
 UNKNOWN = (0.3, 8.0)  # chosen: width change and aspect where the views do not tell
 
@@ -64,7 +64,7 @@ class TubeEvidence:
 
     @property
     def probability(self) -> float:
-        """How likely the candidate is a stem: of as many stems as leaves, whose masks are exact or faulty."""
+        """How likely the candidate is a stem, where there are eight leaves to a stem."""
         change = self.width_change if np.isfinite(self.width_change) else UNKNOWN[0]
         aspect = self.aspect if np.isfinite(self.aspect) else UNKNOWN[1]
         gain = self.gain if np.isfinite(self.gain) else -1.0
