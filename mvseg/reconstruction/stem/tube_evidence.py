@@ -25,7 +25,7 @@ from mvseg.reconstruction.surface.patch_image import view_ious
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-# fitted: python benchmarks/stems.py --cache DIR --plants 2 --evidence; of gain, width change, logarithm of the aspect, and 1
+# fitted: python benchmarks/stems.py --cache DIR --plants 2 --evidence (gain, change, log(aspect), 1)
 WEIGHTS = (31.4, -6.4, 1.39, -3.3)
 UNKNOWN = (0.3, 8.0)  # chosen: width change and aspect where the views do not tell
 
