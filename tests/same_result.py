@@ -61,6 +61,7 @@ def _attributes(of_leaf: Mapping[int, Any] | None, names: Sequence[str]) -> dict
 
 def _describe_traits(traits: Traits) -> dict[Any, Any]:
     said: dict[Any, Any] = {"unit": traits.unit}
+    said["stems"] = [[stem.source, [node.leaf for node in stem.nodes]] for stem in traits.stems]
     tables = {0: traits.whole, **{leaf.leaf: leaf.numbers for leaf in traits.leaves}}
     for leaf, numbers in tables.items():
         said[leaf] = {name: torch.tensor([number.value, number.sd]) for name, number in numbers.items()}

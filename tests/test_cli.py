@@ -81,7 +81,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
         *(f"overlay/{name}" for name in views),
         *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
         *("before_edits.bin", "instances.json", "report.html", "run.json", "scene.glb", "surfaces.npz"),
-        *("traits.csv", "traits_wide.csv"),
+        *("traits.csv", "traits_wide.csv", "nodes.csv"),
     }
     leaf_of_label: dict[int, set[int]] = {}
     for name in views:
@@ -103,7 +103,20 @@ def test_demo_shapes_hold_the_true_leaves(demo: Path) -> None:
         size = np.linalg.norm(true.extents)
         assert np.abs(shape.bounds.mean(0) - true.bounds.mean(0)).max() < 0.2 * size
     scene = trimesh.load_scene(demo / "scene.glb")
-    assert set(scene.graph.nodes_geometry) == {f"leaf_{leaf:03d}" for leaf in range(1, 13)}
+    names = set(scene.graph.nodes_geometry)
+    assert {name for name in names if name.startswith("leaf_")} == {f"leaf_{leaf:03d}" for leaf in range(1, 13)}
+    assert "stem_1" in names
+
+
+def test_demo_has_a_stem_whose_leaves_come_in_pairs(demo: Path) -> None:
+    nodes = list(csv.DictReader((demo / "nodes.csv").read_text().splitlines()))
+    assert sorted(int(node["leaf"]) for node in nodes) == list(range(1, 13))
+    assert {(node["stem"], node["source"], node["phyllotaxis"]) for node in nodes} == {("1", "leaf bases", "decussate")}
+    wide = {row["leaf"]: row for row in csv.DictReader((demo / "traits_wide.csv").read_text().splitlines())}
+    assert all(wide[node["leaf"]]["node_height"] == node["height"] for node in nodes)
+    traits = mvseg.load_result(demo).traits
+    assert traits is not None
+    assert [node.leaf for node in traits.stems[0].nodes] == [int(node["leaf"]) for node in nodes]
 
 
 def test_demo_has_its_traits(demo: Path) -> None:
@@ -206,7 +219,8 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "voxel_budget": 250_000,
             "check_ids": True,
         },
-        "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True},
+        "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True,
+                   "stems": "auto"},
         "views": None,
         "scale": None,
         "unit": None,

@@ -205,6 +205,107 @@ class StemNumbers:
     rounds: int = 5  # limit: rounds of fitting the stem to the bases
 
 
+@dataclass(frozen=True)
+class TubeNumbers:
+    """Tubes that are fitted to masks of stems, and what tells stems from leaves."""
+
+    mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
+    difference: float = 1e-4  # limit: of u, for the directions of a cubic
+    rows: int = 24  # limit: places along a tube at which it is compared with its masks
+    patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
+    num_steps: int = 12  # limit: steps of the fit
+    far_steps: int = 8  # limit: of these, until edges are looked for nearby only
+    far_reach: float = 14.0  # chosen: pixels within which a sample looks for an edge, at first
+    near_reach: float = 6.0  # chosen: the same in the end
+    far_scale_px: float = 4.0  # chosen: distance that has half the weight of none, at first
+    least_scale_px: float = 0.7  # chosen: the same in the end, at least
+    scale_factor: float = 4.0  # chosen: the same in median distances, at least
+    sample_weight: float = 0.35  # chosen: weight of a sample, as of those of patches
+    end_weight: float = 4.0  # chosen: weight of an end, in that of a sample of a side: there is one of it
+    shorten: float = 0.25  # chosen: weight of a mask that ends before the tube, where that of a longer one is 1
+    damping: float = 0.01  # limit: of a step, as a share of the diagonal
+    most_step: float = 0.1  # limit: way of a coefficient in a step, at most, in lengths of the tube
+    least_radius: float = 0.05  # limit: radius after a step, at least, in the mean one before it
+    bend_sd: float = 0.03  # chosen: deviation of third differences of the axis, in lengths
+    speed_sd: float = 0.05  # chosen: deviation of the speed along a piece of the axis, in lengths
+    taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
+    sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
+    quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
+    beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
+    least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
+    most_views: int = 12  # limit: views of a candidate that tell whether it is a stem
+    least_views: int = 3  # limit: views that show the width of a place, for its changes to count
+    width_noise_px: float = 1.0  # chosen: deviation of a width in pixels
+
+
+@dataclass(frozen=True)
+class AxisNumbers:
+    """The axis that leaves point back to, in lengths of the leaf, or of the median leaf."""
+
+    least_leaves: int = 3  # limit: leaves that tell an axis
+    least_of_many: int = 4  # chosen: leaves that tell one of several axes
+    most_pairs: int = 200  # limit: pairs of ends of leaves through which lines are tried
+    most_starts: int = 3  # limit: of all lines that are tried, those that a fit starts from
+    bent_leaves: int = 5  # chosen: leaves from which the axis may bend
+    begins: float = 0.15  # chosen: share of the midrib that tells in which direction it begins
+    lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured
+    longest_petiole: float = 0.8  # chosen: length of a petiole, at most
+    petiole_cost: float = 0.05  # chosen: distance from the axis that a longer petiole is worth, in its length
+    least_petiole: float = 0.01  # limit: length of a petiole below which the axis may not go on along its ray
+    to_bases: float = 0.05  # chosen: weight of the distance of the axis along a ray, where that beside it is 1
+    petiole_square: float = 0.1  # chosen: weight of squared lengths of petioles against distances of their rays
+    arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (of a petiole's chord to its end at the blade)
+    near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
+    near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
+    least_extent: float = 2.5  # chosen: distance between the outer nodes, in median petioles or misses, at least
+    least_miss: float = 0.05  # chosen: what counts as a petiole or a miss, at least
+    lean_cost: float = 1.0  # chosen: cost of a level axis per leaf, where that of a leaf that misses it is 1
+    tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
+    bend_cost: float = 0.2  # chosen: weight against a bend
+    beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths
+    points: int = 40  # limit: points of an axis
+    ray_steps: int = 17  # limit: points of a ray, and again between two of these
+    rounds: int = 14  # limit: rounds of fitting the axis
+    straight_rounds: int = 7  # limit: of these, with a straight one
+
+
+@dataclass(frozen=True)
+class ThinNumbers:
+    """Thin parts in photos, cells of space that show them, and the path through them."""
+
+    longest_px: int = 500  # chosen: longer side of the part of a photo with the plant, at most
+    margin: float = 0.25  # chosen: what is looked at around the plant, as a share of its image
+    beside_px: int = 2  # chosen: distance from a mask within which a leaf may still hide something
+    around_px: int = 15  # chosen: distance to what is around a thin part: it is less wide than this
+    quiet: float = 2.0  # chosen: difference in colour that means nothing, in the median one
+    sure: float = 4.0  # chosen: difference above that which is sure, in the median one
+    least_apart: float = 6.0  # chosen: the same in steps of L, a and b, at least
+    beyond: float = 0.15  # chosen: how far cells reach beyond the leaves, in the extent of these
+    coarse_cells: int = 32  # limit: cells along the plant, at first
+    levels: int = 3  # limit: times that cells are looked at; they are halved in between
+    least_share: float = 0.7  # chosen: mean share of the views that show a cell as thin, at least
+    least_views: int = 3  # limit: views that see a cell, at least
+    view_share: float = 0.35  # chosen: the same as a share of all views
+    around_cells: int = 17  # chosen: side of the cube in which a part is thin or thick, in cells
+    most_filled: float = 0.2  # chosen: share of this cube that shows a thin part, at most
+    most_cells: int = 20_000  # limit: cells through which a path is looked for
+    gap_cells: float = 2.0  # limit: longest step between all cells, in cells
+    bridge_cells: float = 16.0  # chosen: longest step between some of the cells, across what leaves hide, in cells
+    cube_cells: float = 3.0  # limit: side of the cubes of which one cell each has such steps, in cells
+    gap_power: float = 1.5  # chosen: exponent of the cost of a step's length
+    doubt_cost: float = 4.0  # chosen: cost of a cell that no view shows, in that of a sure one
+    touch_cells: float = 8.0  # chosen: distance between a leaf and the cell where its petiole ends, at most
+    touch_cost: float = 30.0  # chosen: cost of entering or leaving a leaf: paths do not run through leaves
+    least_leaves: int = 3  # limit: leaves that are joined, at least
+    least_steps: int = 6  # chosen: cells of a line, at least
+    line_ends: int = 60  # limit: cells of which any two are tried as points of the line of a stem
+    line_cells: float = 2.0  # chosen: distance from the line that has half the weight of none, in cells
+    line_rounds: int = 6  # limit: rounds of fitting the line
+    line_beyond: float = 0.6  # chosen: how far petioles may leave the line beyond its ends, in its length
+    cone: float = 0.12  # chosen: sine of the angle by which a stem may bend beyond its line
+    bend_cost: float = 2.0  # chosen: weight against a bend of the line, in that of a cell
+
+
 RAYS = RayNumbers()
 VOXELS = VoxelNumbers()
 HULL = HullNumbers()
@@ -218,3 +319,6 @@ SEARCH = SearchNumbers()
 DOUBTS = DoubtNumbers()
 ERRORS = ErrorNumbers()
 STEM = StemNumbers()
+TUBE = TubeNumbers()
+AXES = AxisNumbers()
+THIN = ThinNumbers()

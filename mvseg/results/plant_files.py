@@ -19,11 +19,13 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.results.shapes_file import SURFACES_FILE, VOXELS_FILE, write_surfaces, write_voxels
+from mvseg.results.stem_shapes import stem_parts
 from mvseg.scene import Scene
 from mvseg.traits.measure import Traits
-from mvseg.traits.table import write_long, write_wide
+from mvseg.traits.table import write_long, write_nodes, write_wide
 from mvseg.traits.up import level_frame
 
+NODES_FILE = "nodes.csv"
 MAX_FACES = 4000  # triangles of a leaf in scene.glb, at most; its own file has all of them
 METRES = {
     "m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6,
@@ -34,8 +36,8 @@ METRES = {
 
 
 def write_plant(result: Result, folder: Path) -> None:
-    """Write surfaces.npz, voxels.npz, leaves/*.ply, scene.glb and, where traits were measured, traits.csv and
-    traits_wide.csv.
+    """Write surfaces.npz, voxels.npz, leaves/*.ply, scene.glb and, where traits were measured, traits.csv,
+    traits_wide.csv and, where a stem was found, nodes.csv.
 
     Meshes are of credible surfaces, for other instances of voxels. The voxels of a leaf that has both get a file of
     their own.
@@ -55,11 +57,16 @@ def write_plant(result: Result, folder: Path) -> None:
         if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
             voxels = result.voxels[instance].mesh()
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
+    for stem in () if result.traits is None else result.traits.stems:
+        for part in stem_parts(stem):
+            meshes[part.name], colors[part.name] = part.mesh(), part.color
     about, extras = describe_world(result.scene), leaf_extras(result.traits)
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
     if result.traits is not None:
         write_long(folder / "traits.csv", result.traits)
         write_wide(folder / "traits_wide.csv", result.traits, result.instances.probabilities)
+        if result.traits.stems:
+            write_nodes(folder / NODES_FILE, result.traits)
 
 
 def gltf_from_world(scene: Scene) -> NDArray[np.float64]:

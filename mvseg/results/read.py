@@ -45,7 +45,9 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.traits.measure import Traits
 
 MOST_INSTANCES = 65534  # number of instances that a label image of 16 bits can hold
-READ_FILES = (DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "surfaces.npz", "voxels.npz")
+READ_FILES = (
+    DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "nodes.csv", "surfaces.npz", "voxels.npz"
+)  # fmt: skip
 Box = tuple[int, int, int, int]
 
 
@@ -316,7 +318,8 @@ def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
     from mvseg.traits.table import read_traits
 
     world, paths = run.traits, (folder / "traits.csv", folder / "traits_wide.csv")
-    return read_traits(*paths, plant=scene.name, unit=world.unit or "", up=world.up)
+    nodes = _find_file(folder, run, "nodes.csv")
+    return read_traits(*paths, nodes, plant=scene.name, unit=world.unit or "", up=world.up)
 
 
 def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: Traits | None) -> Instances:

@@ -34,6 +34,8 @@ class Plant:
         family: a key of `FAMILIES`.
         leaves, parts: meshes; the first `len(stems)` parts are the stems.
         stems: (n, 3) points of each stem, from the foot to the tip, mm.
+        petioles: (n, 3) points of the petiole of each leaf, or of the rachis that its leaflet sits on, from its node on
+            the stem, mm; () where they are not known.
         is_wild: see `wild.make_wild`; its surroundings are those of homes and gardens, too.
     """
 
@@ -41,6 +43,7 @@ class Plant:
     leaves: tuple[Leaf, ...]
     parts: tuple[Part, ...]
     stems: tuple[Floats, ...] = ()
+    petioles: tuple[Floats, ...] = ()
     is_wild: bool = False
     unit: str = "mm"
 
@@ -105,7 +108,9 @@ def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
         foot = np.append(rng.uniform(-0.4, 0.4, 2) * ranges.pot_radius, -1.0)
         top = foot + np.array([rng.normal(0, 10), rng.normal(0, 10), rng.uniform(60, 200)])
         tubes.append(make_tube("stake", np.linspace(foot, top, 8), radius=rng.uniform(1.5, 4), taper=1.0))
-    return Plant(family=family, leaves=leaves, parts=(*tubes, *pot_parts(pot, rng)), stems=tuple(stems))
+    petioles = tuple(frond.rachis for frond in fronds for _ in frond.blades)
+    parts = (*tubes, *pot_parts(pot, rng))
+    return Plant(family=family, leaves=leaves, parts=parts, stems=tuple(stems), petioles=petioles)
 
 
 # --- fronds

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_choices
 
 Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that points up, or what shows it
 
@@ -25,14 +25,18 @@ class TraitsConfig:
         leaves_only: leave out what looks like a stem (long and steep, and a surface explains its masks badly), the
             floor (below everything else, and far larger) or something beside the plant (more than two leaf lengths away
             from it). Stems and the floor are recognised only if up is known.
+        stems: auto: find the stems that the leaves sit on, with their nodes (docs/traits.md), where leaves and photos
+            agree about them; off: do not look for any.
     """
 
     min_sure_views: int = 2
     min_quality: float = 0.5
     min_visible_share: float = 0.05
     leaves_only: bool = True
+    stems: Literal["auto", "off"] = "auto"
 
     def __post_init__(self) -> None:
+        check_choices(self, "traits")
         if self.min_sure_views < 0:
             raise InputError(f"traits.min_sure_views is {self.min_sure_views}, expected 0 or more")
         for name, share in (("min_quality", self.min_quality), ("min_visible_share", self.min_visible_share)):

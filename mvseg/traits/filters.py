@@ -21,8 +21,8 @@ Floats = NDArray[np.float64]
 # The first ones are the gravest.
 Kind = Literal["few_sure_views", "low_quality", "hardly_visible", "stem", "floor", "beside_the_plant"]
 
-# Found on simulated plants with masks of stems and of a tape on the floor, and on a real basil; see docs/traits.md.
-LONG, STEEP_DEG, TUBE_IOU = 8.0, 70.0, 0.9  # of stems: longer than wide by this, steeper and explained worse than this
+SURELY_STEM = 0.9  # chosen: probability from which an instance is a stem, see `TubeEvidence`
+# Found on simulated plants with masks of a tape on the floor, and on a real basil; see docs/traits.md.
 FLOOR_AREA = 1.8  # times that of the largest other instance
 FAR = 2.0  # lengths of the longest instance but one, from instance to instance
 FEWEST = 3  # instances, for floor and distance to be told
@@ -67,27 +67,22 @@ class _Body:
     Attributes:
         points: (P, 3) on it.
         deviations: (3,) standard deviations along its principal axes, the largest first.
-        axis: (3,) the first of these.
         area: one-sided.
-        iou: see `median_iou`; 0 for voxels.
     """
 
     points: Floats
     deviations: Floats
-    axis: Floats
     area: float
-    iou: float
 
     @staticmethod
     def of(shape: LeafSurface | VoxelGrid) -> _Body:
         every = shape.points().reshape(-1, 3) if isinstance(shape, LeafSurface) else shape.points
         points = every.cpu().numpy()
-        variances, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+        variances = np.linalg.eigvalsh(np.cov(points.T, bias=True))
         deviations = np.sqrt(np.maximum(variances[::-1], 0))
         few = points[:: max(1, len(points) // NUM_POINTS)]
-        if isinstance(shape, LeafSurface):
-            return _Body(few, deviations, axes[:, -1], area=shape.area, iou=median_iou(shape))
-        return _Body(few, deviations, axes[:, -1], area=12 * float(deviations[0] * deviations[1]), iou=0.0)
+        area = shape.area if isinstance(shape, LeafSurface) else 12 * float(deviations[0] * deviations[1])
+        return _Body(few, deviations, area=area)
 
     @property
     def length(self) -> float:
@@ -102,16 +97,18 @@ def find_rejected(
     config: TraitsConfig,
     sure_views: Mapping[int, int] = MappingProxyType({}),
     visible_shares: Mapping[int, float] = MappingProxyType({}),
+    stems: Mapping[int, float] = MappingProxyType({}),
 ) -> dict[int, Rejection]:
     """The instances that are not measured as leaves.
 
     Args:
         shapes: {instance id: its shape}, instances without one left out.
-        up: (3,) unit vector; None: not known, so that stems and the floor are not told.
+        up: (3,) unit vector; None: not known, so that the floor is not told.
         config: what is asked of a leaf.
         sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
         visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
             surface.
+        stems: {instance id: how likely it is a stem}, of those that are long.
 
     Returns:
         {instance id: why}: the gravest of several reasons, see `Kind`.
@@ -129,10 +126,13 @@ def find_rejected(
         found |= {instance: Rejection(kind, reason.format(value, least)) for instance, value in below.items()}
     if not config.leaves_only:
         return found
+    for instance, chance in stems.items():
+        if chance >= SURELY_STEM and instance not in found:
+            found[instance] = Rejection("stem", f"{WORDS['stem']}: a tube explains its masks, probability {chance:.2f}")
     bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
     rules: list[Callable[[dict[int, _Body]], dict[int, Rejection]]] = [find_distant]
     if up is not None:
-        rules = [partial(find_stems, up=up), partial(find_floor, up=up), *rules]
+        rules = [partial(find_floor, up=up), *rules]
     for rule in rules:
         found |= rule({instance: body for instance, body in bodies.items() if instance not in found})
     return dict(sorted(found.items()))
@@ -142,18 +142,6 @@ def median_iou(surface: LeafSurface) -> float:
     """Of a surface with its masks; 0 where that is not known."""
     iou = surface.iou[surface.iou.isfinite()]
     return float(iou.median()) if len(iou) else 0.0
-
-
-def find_stems(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
-    """Long and steep ones; a blade that stands upright is told from them by a surface that explains its masks."""
-    found = {}
-    for instance, body in bodies.items():
-        elongation = body.deviations[0] / max(body.deviations[1], 1e-12)
-        steepness = np.degrees(np.arcsin(min(1.0, abs(float(body.axis @ up)))))
-        if elongation > LONG and steepness > STEEP_DEG and body.iou < TUBE_IOU:
-            reason = f"{WORDS['stem']}: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
-            found[instance] = Rejection("stem", reason)
-    return found
 
 
 def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:

@@ -19,11 +19,14 @@ from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Rejection, find_rejected, median_iou
 from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import LEAF_TRAITS
 from mvseg.traits.plant import measure_whole
+from mvseg.traits.stems import find_stems, find_tubes
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
+NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
 NO_VIEWS = torch.zeros(0, dtype=torch.int64)
 
 
@@ -56,6 +59,7 @@ class Traits:
         leaves: one entry per instance, by id.
         whole: {trait: number} of all `PLANT_TRAITS`.
         up: unit vector, None when unknown.
+        stems: with their nodes, that of the most leaves first.
     """
 
     plant: str
@@ -63,6 +67,7 @@ class Traits:
     leaves: tuple[LeafTraits, ...]
     whole: Mapping[str, Measurement]
     up: tuple[float, float, float] | None
+    stems: tuple[Stem, ...] = ()
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -105,13 +110,24 @@ def measure_plant(
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
+    tubes = find_tubes(surfaces or {}, masks, scene.cameras) if config.leaves_only else {}
     rejected = find_rejected(
-        shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
+        shapes,
+        None if frame is None else frame[2],
+        config=config,
+        sure_views=sure_views,
+        visible_shares=visible,
+        stems={instance: each.probability for instance, each in tubes.items()},
     )
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     ground = 0.0  # heights start from the lowest point of all blades
     if frame is not None and blades:
         ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
+    stems: tuple[Stem, ...] = ()
+    if config.stems == "auto":
+        seen = [tubes[instance].tube for instance, why in rejected.items() if why.kind == "stem"]
+        stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
+    of_leaf = {node.leaf: node for stem in stems for node in stem.nodes}
     leaves = []
     for instance in instances:
         num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
@@ -120,13 +136,16 @@ def measure_plant(
             numbers["sure_views"] = Measurement(float(sure_views[instance]), float("nan"), "matching")
         if instance in blades:
             numbers |= measure_leaf(blades[instance], frame, ground=ground) | appearance[instance]
+            numbers["node_height"] = NO_NODE
+        if (node := of_leaf.get(instance)) is not None:
+            numbers |= {"node_height": node.height, "insertion_angle": node.insertion_angle}
         if instance in voxels and instance not in rejected:
             numbers |= measure_voxels(voxels[instance])
         fitted = None if surfaces is None else surfaces.get(instance, LeafSurface.none(NO_VIEWS, "has no masks"))
         rejection = rejected.get(instance)
         leaves.append(describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejection))
     whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected))
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up)
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=stems)
 
 
 def describe_leaf(

@@ -45,10 +45,11 @@ SURFACE_TRAITS = (
     Definition("tip_inclination", "degree", "of the midrib at the tip against the horizontal, positive = rising"),
     Definition("azimuth", "degree", "direction from base to tip, counterclockwise seen from above, in [0, 360)"),
     Definition("insertion_height", "length", "of the base above the lowest point of all measured leaves"),
-    Definition("insertion_angle", "degree", "between the midrib at the base and up (the stem)", "TO:0000206"),
+    Definition("insertion_angle", "degree", "between the midrib at the base and the stem, or up", "TO:0000206"),
     Definition("curvature", "degree", "between the midrib's directions at base and tip: 0 = straight"),
     Definition("fold_angle", "degree", "between the two halves of the blade at mid length: 180 = flat"),
 )
+NODE_TRAITS = (Definition("node_height", "length", "of its node, along the stem, from the lowest one"),)
 SEEN_TRAITS = (
     _counted("visible_share", "share of the surface's projections that the leaf's own masks cover"),
     Definition("mean_red", "1", "mean red of the surely seen pixels, 0 to 1"),
@@ -72,7 +73,7 @@ COUNTED_TRAITS = (
     _counted("sure_views", "views with a sure match"),
     _counted("iou", "median IoU of the surface with the leaf's masks"),
 )
-LEAF_TRAITS = (*SURFACE_TRAITS, *SEEN_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS)
+LEAF_TRAITS = (*SURFACE_TRAITS, *NODE_TRAITS, *SEEN_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS)
 PLANT_TRAITS = (
     _counted("number_of_leaves", "instances that are not rejected", "TO:0000241"),
     Definition("total_leaf_area", "area", "of the leaves that have a surface; the method says how many have none"),

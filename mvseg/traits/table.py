@@ -12,10 +12,17 @@ from mvseg.formats.text_file import read_table, write_table
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
 MOST_BYTES = 1 << 30  # of a table that is read
+NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "azimuth")
+NODE_COLUMNS = (
+    "plant", "stem", "node", "leaf", *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),
+    "x", "y", "z", "base_x", "base_y", "base_z", "unit", "source", "phyllotaxis", "phyllotaxis_angle",
+    "phyllotaxis_probability",
+)  # fmt: skip
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 GOOD, REJECTED = "good", "rejected: "
 
@@ -51,6 +58,56 @@ def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = 
     write_table(path, wide_columns(), rows)
 
 
+def write_nodes(path: Path, traits: Traits) -> None:
+    """One row per node, from the lowest to the highest one of each stem: its leaf, its numbers with their standard
+    deviations, where it is and where the blade begins, and the phyllotaxis of its stem."""
+    rows = []
+    for stem in traits.stems:
+        suggested = stem.phyllotaxis
+        for node in stem.nodes:
+            measured = (getattr(node, name) for name in NODE_NUMBERS)
+            numbers = [*chain.from_iterable((each.value, each.sd) for each in measured), *node.place, *node.base]
+            texts = traits.unit or UNKNOWN_UNIT, stem.source, suggested.name
+            of_stem = suggested.angle, suggested.probability
+            rows.append((traits.plant, stem.number, node.number, node.leaf, *numbers, *texts, *of_stem))
+    write_table(path, NODE_COLUMNS, rows)
+
+
+def read_nodes(path: Path) -> tuple[Stem, ...]:
+    """The stems whose nodes `write_nodes` wrote; their axes lead straight from node to node.
+
+    Raises:
+        InputError: it is no such table.
+    """
+    nodes: dict[int, list[Node]] = {}
+    about: dict[int, tuple[str, Phyllotaxis]] = {}
+    try:
+        for row in read_csv(path, NODE_COLUMNS):
+            numbers = {
+                name: Measurement(_number(row[name]), _number(row[f"{name}_sd"]), row["source"])
+                for name in NODE_NUMBERS
+            }
+            place = _number(row["x"]), _number(row["y"]), _number(row["z"])
+            base = _number(row["base_x"]), _number(row["base_y"]), _number(row["base_z"])
+            stem, number, leaf = (int(row[name]) for name in ("stem", "node", "leaf"))
+            nodes.setdefault(stem, []).append(Node(number=number, leaf=leaf, place=place, base=base, **numbers))
+            angle, probability = _number(row["phyllotaxis_angle"]), _number(row["phyllotaxis_probability"])
+            about[stem] = row["source"], Phyllotaxis(row["phyllotaxis"], angle, probability)
+    except (KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: is no table of nodes that mvseg wrote ({error})") from None
+    return tuple(
+        Stem(number=stem, tube=thin_tube([node.place for node in each]), source=about[stem][0], nodes=tuple(each),
+             phyllotaxis=about[stem][1])
+        for stem, each in nodes.items()
+    )  # fmt: skip
+
+
+def _number(text: str) -> float:
+    return float(text or "nan")
+
+
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
     pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in LEAF_TRAITS]
@@ -58,9 +115,16 @@ def wide_columns() -> list[str]:
 
 
 def read_traits(
-    long: Path, wide: Path, *, plant: str, unit: str, up: tuple[float, float, float] | None
+    long: Path,
+    wide: Path,
+    nodes: Path | None = None,
+    *,
+    plant: str,
+    unit: str,
+    up: tuple[float, float, float] | None,
 ) -> Traits:
-    """The traits that `write_long` and `write_wide` wrote, with six digits; what the tables do not say is given.
+    """The traits that `write_long`, `write_wide` and `write_nodes` wrote, with six digits; what the tables do not say
+    is given.
 
     Raises:
         InputError: these are no such tables.
@@ -79,7 +143,8 @@ def read_traits(
             raise
         raise InputError(f"{long}: is no table of traits that mvseg wrote ({error})") from None
     whole = {name: number for name, number in numbers[0].items() if name in DEFINITIONS}  # others are of older versions
-    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up)
+    stems = () if nodes is None else read_nodes(nodes)
+    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up, stems=stems)
 
 
 def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement]) -> LeafTraits:
@@ -87,7 +152,8 @@ def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurem
     rejection = None
     if reasons and reasons[0].startswith(REJECTED):
         rejection = Rejection.of(reasons[0].removeprefix(REJECTED))
-    absent = {name: missing("has no voxels") for name in VOXEL_NAMES}  # the only ones that have no row then
+    # The only ones that have no row: where there are no voxels, and in tables of older versions.
+    absent = {name: missing("has no voxels") for name in VOXEL_NAMES} | {"node_height": missing("of an older version")}
     return LeafTraits(
         leaf=leaf,
         numbers={trait.name: {**absent, **numbers}[trait.name] for trait in LEAF_TRAITS},

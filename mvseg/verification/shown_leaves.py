@@ -41,8 +41,8 @@ class GivenScores:
     price: float
 
 
-# chosen: any price from 1.5 to 14.3 gives the dense basil the same ids; from 9.9 on, four right masks of a maize stay. --fit says
-# 4.2 on real plants and simulated ones: a right mask that is lost is worse than one that is not won.
+# Chosen, the price: any from 1.5 to 14.3 gives the dense basil the same ids; from 9.9 on, four right masks of a maize
+# stay. --fit says 4.2 on real plants and simulated ones: a right mask lost is worse than one that is not won.
 GIVEN = GivenScores(
     shows={"surface": 1.962, "match score": 0.359, "matched to another": -1.66, "visible": 1.214, "within": 0.764,
            "no surface": 1.007, "match score, no surface": 0.866},

@@ -80,10 +80,10 @@ def test_a_leaf_is_fitted_again_only_where_something_that_it_follows_from_change
 
 
 def test_only_leaves_that_are_near_can_hide_one() -> None:
-    frames = fitting._instance_frames(REGIONS, IDS, FEW)
+    frames = fitting.instance_frames(REGIONS, IDS, FEW)
     points = {number: leaf.points().numpy() for number, leaf in LEAVES.items()}
     for own, near in ((1, {2}), (2, {1}), (3, set[int]())):
-        masks = fitting._stack(REGIONS.select(own == IDS), FEW, frames, instance=own)
+        masks = fitting.stack_instance(REGIONS.select(own == IDS), FEW, frames, instance=own)
         others = {number: grid for number, grid in points.items() if number != own}
         selected = select_hiding(masks, points[own], others)
         assert {*selected} == near

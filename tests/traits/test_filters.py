@@ -5,14 +5,13 @@ from functools import partial
 
 import numpy as np
 import pytest
-import torch
 
 from known_leaves import bent_blade, fit_coefficients, flat_leaf, flat_sheet, make_surface, move, turn_about
 from mvseg.errors import InputError
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.config import TraitsConfig
-from mvseg.traits.filters import find_rejected
+from mvseg.traits.filters import Rejection, find_rejected
 
 UP = np.array([0.0, 0.0, 1.0])
 CONFIG = TraitsConfig()
@@ -33,12 +32,6 @@ def tape(z: float) -> LeafSurface:
     return flat_leaf(length=150, half_width=9, at=(-70, 30, z))
 
 
-def voxel_rod(height: int) -> VoxelGrid:
-    votes = torch.zeros(4, 4, height)
-    votes[1:3, 1:3] = 1
-    return VoxelGrid(origin=torch.zeros(3).double(), voxel_size=1.0, votes=votes, num_views=3, threshold=0.5)
-
-
 def kinds(shapes: Mapping[int, Shape], *, up: np.ndarray | None = UP, config: TraitsConfig = CONFIG) -> dict[int, str]:
     return {i: rejection.kind for i, rejection in find_rejected(shapes, up, config=config).items()}
 
@@ -52,10 +45,7 @@ def test_leaves_are_leaves() -> None:
 @pytest.mark.parametrize(
     ("shape", "kind"),
     [
-        (upright(length=90, half_width=3, iou=0.85), "stem"),
-        (upright(length=90, half_width=3, iou=0.95), None),  # a grass leaf explains its masks
-        (upright(length=30, half_width=8, iou=0.85), None),  # short and wide
-        (voxel_rod(60), "stem"),
+        (upright(length=90, half_width=3, iou=0.85), None),  # what no tube explains is no stem
         (tape(-30.0), "floor"),
         (tape(20.0), None),  # large, but amid the plant
         (flat_leaf(length=30, half_width=5, at=(0, 0, -30)), None),  # the lowest leaf
@@ -72,9 +62,18 @@ def test_what_is_no_leaf(shape: Shape, kind: str | None) -> None:
 
 def test_the_world_may_be_turned_and_scaled() -> None:
     turn = turn_about(np.array([1.0, 2.0, -1.0]), 111)
-    others = {7: upright(length=90, half_width=3, iou=0.85), 8: tape(-30.0), 9: flat_leaf(at=(200, 0, 30))}
+    others = {8: tape(-30.0), 9: flat_leaf(at=(200, 0, 30))}
     shapes = {i: move(shape, turn, scale=0.01, shift=(5, -3, 2)) for i, shape in (plant() | others).items()}
-    assert kinds(shapes, up=turn @ UP) == {7: "stem", 8: "floor", 9: "beside_the_plant"}
+    assert kinds(shapes, up=turn @ UP) == {8: "floor", 9: "beside_the_plant"}
+
+
+def test_what_a_tube_explains_is_a_stem_unless_all_instances_are_wanted() -> None:
+    shapes, chances = plant(), {1: 0.95, 2: 0.85, 3: 0.02, 7: 0.99}  # 7 has no shape
+    found = find_rejected(shapes, None, config=CONFIG, stems=chances)
+    assert {i: rejection.kind for i, rejection in found.items()} == {1: "stem", 7: "stem"}
+    assert found[1].reason == "looks like a stem: a tube explains its masks, probability 0.95"
+    assert Rejection.of(found[1].reason) == found[1]
+    assert find_rejected(shapes, None, config=TraitsConfig(leaves_only=False), stems=chances) == {}
 
 
 def test_two_groups_apart_are_both_kept() -> None:

@@ -82,7 +82,7 @@ def fit_surfaces(
     cache = SurfaceCache() if cache is None else cache
     workers = now_running().workers if len(regions) >= SEARCH.few_masks else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
-    frames = _instance_frames(regions, instance_ids, cameras)
+    frames = instance_frames(regions, instance_ids, cameras)
     surfaces: dict[int, LeafSurface] = {}
     asked: dict[int, _Asked] = {}
     for instance in _ids(instance_ids):
@@ -95,7 +95,7 @@ def fit_surfaces(
         members = members.select(torch.isin(members.view_index, views[spread_views(cameras[views], most)]))
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
-        masks = _stack(members, cameras, frames, instance=instance)
+        masks = stack_instance(members, cameras, frames, instance=instance)
         asked[instance] = _Asked(name_first(masks, rough), masks, rough)
     first = {each.name: each for each in asked.values()}
     if is_rough:
@@ -174,7 +174,7 @@ def _ids(instance_ids: Tensor) -> list[int]:
     return instance_ids[instance_ids > 0].unique().tolist()
 
 
-def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
+def instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
     """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
     last = int(instance_ids.max()) if len(instance_ids) else 0
     values = torch.where(instance_ids > 0, instance_ids, max(last, 0) + 1 + torch.arange(len(instance_ids)))
@@ -234,7 +234,7 @@ def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
     return float(ious.mean() - wide_cost(fit.coefficients))
 
 
-def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
+def stack_instance(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
     """The outlines of one instance, in photos turned to a side of its own; its masks of one view are united."""
     views = members.view_index.unique().tolist()
     united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]

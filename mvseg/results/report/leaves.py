@@ -15,6 +15,7 @@ from mvseg.traits.measure import Traits
 from mvseg.traits.ontology import (
     COUNTED_TRAITS,
     LEAF_TRAITS,
+    NODE_TRAITS,
     PLANT_TRAITS,
     SEEN_TRAITS,
     SURFACE_TRAITS,
@@ -73,7 +74,7 @@ def describe_traits(traits: Traits | None) -> dict[str, Any]:
     """
     if traits is None:
         return {"traits": [], "plantTraits": [], "whole": {}}
-    order = (*SURFACE_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS, *SEEN_TRAITS)
+    order = (*SURFACE_TRAITS, *NODE_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS, *SEEN_TRAITS)
     shown = [trait for trait in order if any(leaf.numbers[trait.name].exists for leaf in traits.leaves)]
     return {
         "traits": [_describe_trait(trait, traits.unit) | {"isColumn": trait.name not in NO_COLUMNS} for trait in shown],

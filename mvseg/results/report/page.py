@@ -20,11 +20,12 @@ from mvseg.results.report.correct import describe_correct, describe_doubts
 from mvseg.results.report.leaves import describe_leaves, describe_traits
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
+from mvseg.results.report.stems import describe_stems, draw_lines
 from mvseg.results.result import Result
 
 ASSETS = files("mvseg.results.report") / "assets"
 SCRIPTS = (
-    "selection.js", "numbers.js", "shapes.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js",
+    "selection.js", "numbers.js", "shapes.js", "stems.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js",
     "lens.js", "edits.js", "brush.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
 )  # fmt: skip
 RUN_FIELDS = (
@@ -72,8 +73,12 @@ def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[s
         "plant": scene.name,
         "unit": scene.unit or "world unit",
         "numMasks": len(result.regions),
-        "views": [{"name": view.name} | picture.as_json() | {"masks": masks} for view, picture, masks in shown],
+        "views": [
+            {"name": view.name} | picture.as_json() | {"masks": masks, "stems": draw_lines(result, index, picture)}
+            for index, (view, picture, masks) in enumerate(shown)
+        ],
         "leaves": describe_leaves(result),
+        "stems": describe_stems(result),
         **describe_traits(result.traits),
         "space": describe_space(result),
         "correct": describe_correct(result, pictures, run=run),

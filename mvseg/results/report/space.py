@@ -20,8 +20,10 @@ from mvseg.formats.mesh import simplify_mesh
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.results.report.stems import parts_of
 from mvseg.results.result import Result
 from mvseg.results.scale_bar import round_length
+from mvseg.results.stem_shapes import StemPart
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import level_frame
 
@@ -71,6 +73,7 @@ def describe_space(result: Result) -> dict[str, Any]:
     low = min((float(points[:, 1].min()) for points in placed.values()), default=-1.0)
     return {
         "leaves": {leaf: _encode(placed[leaf], mesh) for leaf, mesh in meshes.items()},
+        "stems": [_describe_part(part, frame) for part in parts_of(result)],
         "cameras": describe_cameras(result.scene.cameras, frame),
         "ground": round(low, 4),
         "grid": grid_step(frame.radius),
@@ -132,6 +135,12 @@ def describe_cameras(cameras: Cameras, frame: Frame) -> list[dict[str, Any]]:
 def grid_step(radius: float) -> float:
     """Side of the squares of the grid: 1, 2 or 5 times a power of ten, a fifth to a half of the plant's radius."""
     return round_length(radius / 2)
+
+
+def _describe_part(part: StemPart, frame: Frame) -> dict[str, Any]:
+    mesh = part.mesh()
+    about: dict[str, Any] = {"color": f"#{bytes(part.color).hex()}"} | _encode(frame.place(mesh.vertices), mesh)
+    return about if part.leaf is None else about | {"leaf": part.leaf}
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:

@@ -19,6 +19,7 @@ function describePlant(data) {
   if (data.plantTraits.length) {
     parts.push(element("h3", {}, "Traits of the plant"), traitTable(data.plantTraits, data.whole));
   }
+  parts.push(...data.stems.flatMap((stem) => describeStem(stem, data)));
   if (rejected) {
     parts.push(element("p", { class: "note" }, `${rejected} of ${data.leaves.length} do not count as leaves.`));
   }

@@ -66,7 +66,7 @@ function drawView(view, address, colors, marks) {
     picture.append(drawMask(mask, colors, marks));
     if (mask.leaf > 0) numbers.push(writeNumber(mask, marks));
   }
-  picture.append(...numbers);
+  picture.append(...view.stems.map(drawStem), ...numbers);
   return picture;
 }
 

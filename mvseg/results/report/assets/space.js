@@ -24,7 +24,7 @@ class Space {
     this.backdrop = makeBackdrop();
     this.scene = new THREE.Scene().add(
       makeSky(), this.camera.add(makeLamp()), this.ground, this.backdrop,
-      ...this.leaves.map((leaf) => leaf.mesh), ...this.cameras.map((one) => one.group));
+      ...this.leaves.map((leaf) => leaf.mesh), ...data.space.stems.map(makeStem), ...this.cameras.map((one) => one.group));
     this.labels = makeLabels(this.leaves);
   }
 

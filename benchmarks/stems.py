@@ -1,0 +1,194 @@
+"""How good are nodes, and are stems told from leaves? `python benchmarks/stems.py --cache ~/mvseg-cells [--plants 6]`
+
+Simulated plants of 8 leaves with true ids, 480 x 480, 10 views on a 200 degree arc. Masks are exact, or have the faults
+of a segmenter (`faults.py`); no photos are used. By family and kind of masks: plants whose leaves agree about a stem;
+leaves with a node, of all; median / 90th percentile of the error of node heights in % of the plant's height, above its
+lowest node that was found, and of divergence angles in degrees, in the true order; shares inside 95 % intervals, of
+heights and azimuths; pairs of neighbours in the right order; plants whose phyllotaxis is right; processor time in that
+of the surfaces.
+
+`--evidence` gives stems masks, too, and prints how well each number of `TubeEvidence` tells them from leaves (area
+under the ROC curve: of all leaves, and of straps, ferns and lanceolate ones), and the weights of its probability,
+fitted to both kinds of masks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.faults import Faults, degrade_labels
+from benchmarks.label_maps import KINDS, MIN_PIXELS, load_maps
+from mvseg.evaluation.truth import shown_instances
+from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
+from mvseg.reconstruction.stem.tube_evidence import UNKNOWN, tube_evidence
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.regions import regions_from_label_maps
+from mvseg.scene import Cameras
+from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
+from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.ray_cast import build_bvh, merge_meshes
+from mvseg.simulation.scene_writer import drop_small
+from mvseg.traits.nodes import measure_stem
+from mvseg.traits.up import level_frame
+
+NUM_LEAVES, NUM_VIEWS = 8, 10
+PHYLLOTAXIS = {
+    "ovate": "decussate", "lanceolate": "spiral", "lobed": "spiral", "strap": "distichous", "leggy": "decussate"
+}  # fmt: skip
+HARD = ("strap", "fern", "lanceolate")
+
+
+def measure_nodes(spec: SceneSpec, kind: str, cache: Path) -> dict[str, Any]:
+    """The errors of one plant."""
+    scene, plant = load_maps(spec, cache), grow_plant(spec.family, spec.num_leaves, spec.seed)
+    regions, ids = scene.masks(kind)
+    start = time.process_time()
+    surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras)
+    fitted = time.process_time()
+    blades = {leaf: surface for leaf, surface in surfaces.items() if surface.is_credible}
+    up = np.array([0.0, 0.0, 1.0])
+    stems = [measure_stem(axis.tube, axis.bases.select(axis.is_near), frame=level_frame(up), source="leaf bases")
+             for axis in axes_of_bases(blades, up)]  # fmt: skip
+    share = (time.process_time() - fitted) / (fitted - start)
+    tall = np.ptp(np.concatenate([*(leaf.vertices for leaf in plant.leaves), *plant.stems])[:, 2])
+    errors: list[tuple[float, float, float, float]] = []
+    divergence: list[float] = []
+    ordered: list[bool] = []
+    for stem in stems:
+        petioles = [plant.petioles[node.leaf - 1] for node in stem.nodes]
+        height = np.array([each[0, 2] for each in petioles])
+        azimuth = np.degrees([np.arctan2(*(each[1] - each[0])[[1, 0]]) for each in petioles])
+        measured = np.array([node.azimuth.value for node in stem.nodes])
+        for node, true, turned in zip(stem.nodes[1:], height[1:] - height[0], azimuth[1:], strict=True):
+            apart = (node.azimuth.value - turned + 180) % 360 - 180
+            height_error, height_sd = (100 * each / tall for each in (node.height.value - true, node.height.sd))
+            errors.append((height_error, height_sd, apart, node.azimuth.sd))
+        steps = [np.abs((np.diff(each) + 180) % 360 - 180) for each in (measured, azimuth)]
+        divergence += np.abs(steps[0] - steps[1]).tolist()
+        ordered += (np.diff(height) > -0.01 * tall).tolist()
+    right = [stem.phyllotaxis.name == PHYLLOTAXIS[spec.family] for stem in stems]
+    about = {"share": share, "stems": len(stems), "leaves": len(plant.leaves), "phyllotaxis": right[:1]}
+    return {**about, "errors": errors, "divergence": divergence, "ordered": ordered}
+
+
+def print_nodes(cache: Path, num_plants: int) -> None:
+    print("| family | masks | stem | nodes | height, % | divergence | inside | order | phyllotaxis | time, % |")
+    for kind in KINDS:
+        every: list[dict[str, Any]] = []
+        for family in PHYLLOTAXIS:
+            specs = [SceneSpec(f"stems/{family}_{seed}", "dev", family, NUM_LEAVES, NUM_VIEWS, seed)
+                     for seed in range(1, num_plants + 1)]  # fmt: skip
+            rows = [measure_nodes(spec, kind, cache) for spec in specs]
+            print(f"| {family} | {kind} | {summarise(rows)} |", flush=True)
+            every += rows
+        print(f"| all | {kind} | {summarise(every)} |", flush=True)
+
+
+def summarise(rows: list[dict[str, Any]]) -> str:
+    errors = np.array([each for row in rows for each in row["errors"]]).reshape(-1, 4)
+    divergence = np.array([each for row in rows for each in row["divergence"]])
+    height, height_sd, azimuth, azimuth_sd = errors.T
+    inside = [np.mean(np.abs(each) <= 1.96 * sd) for each, sd in ((height, height_sd), (azimuth, azimuth_sd))]
+    nodes = (len(errors) + sum(row["stems"] for row in rows)) / sum(row["leaves"] for row in rows)
+    right = [each for row in rows for each in row["phyllotaxis"]]
+    cells = [
+        f"{sum(row['stems'] > 0 for row in rows)} of {len(rows)}", f"{nodes:.2f}",
+        *("{:.1f} / {:.1f}".format(*np.quantile(np.abs(each), (0.5, 0.9))) for each in (height, divergence)),
+        f"{inside[0]:.2f}, {inside[1]:.2f}", f"{np.mean([each for row in rows for each in row['ordered']]):.2f}",
+        f"{sum(right)} of {len(right)}", f"{100 * np.mean([row['share'] for row in rows]):.1f}",
+    ]  # fmt: skip
+    return " | ".join(cells)
+
+
+def part_maps(plant: Plant, cameras: Cameras) -> list[np.ndarray]:
+    """V label maps of leaves, and after them of the stems, without petioles."""
+    mesh, num = merge_meshes(plant), len(plant.leaves) + len(plant.stems)
+    faces = [len(leaf.faces) for leaf in plant.leaves] + [len(part.faces) for part in plant.parts]
+    owner = np.repeat(np.arange(1, len(faces) + 1), faces)
+    owner[owner > num] = 0
+    bvh, maps = build_bvh(mesh), []
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        v, u = np.mgrid[:height, :width] + 0.5
+        rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ cameras.world_from_px[view].numpy().T
+        start = np.tile(cameras.centers[view].numpy().astype(np.float32), (len(rays), 1))
+        face = bvh.run(start, rays.astype(np.float32))
+        labels = np.where(face >= 0, owner[face], 0).reshape(height, width).astype(np.uint16)
+        maps.append(drop_small(labels, MIN_PIXELS))
+    return maps
+
+
+def collect_evidence(num_plants: int) -> list[dict[str, Any]]:
+    """A row per leaf and stem, and kind of masks."""
+    rows = []
+    for family in (*PHYLLOTAXIS, "fern"):
+        for seed in range(1, num_plants + 1):
+            spec = SceneSpec(f"stems/{family}_{seed}", "dev", family, NUM_LEAVES, NUM_VIEWS, seed)
+            plant = grow_plant(family, NUM_LEAVES, seed)
+            cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
+            true = part_maps(plant, cameras)
+            faulty = [degrade_labels(each, Faults(), seed=100 * seed + view) for view, each in enumerate(true)]
+            for kind, maps in zip(KINDS, (true, faulty), strict=True):
+                regions = regions_from_label_maps(maps)
+                ids = shown_instances(regions, true, count_background=False)
+                ids = torch.where(ids > 0, ids, -1)
+                surfaces = fit_surfaces(regions, ids, cameras, is_rough=True)
+                for instance, found in tube_evidence(regions, ids, cameras, surfaces=surfaces).items():
+                    numbers = {"gain": found.gain, "width_change": found.width_change, "aspect": found.aspect}
+                    about = {"family": family, "kind": kind, "is_stem": instance > NUM_LEAVES}
+                    rows.append({**about, **numbers, "probability": found.probability})
+    return rows
+
+
+def print_evidence(num_plants: int) -> None:
+    rows = collect_evidence(num_plants)
+    print("| masks | number | all leaves | straps, ferns, lanceolate | stems | leaves |")
+    for kind in KINDS:
+        for name, sign in (("gain", 1), ("width_change", -1), ("aspect", 1), ("probability", 1)):
+            known = [row for row in rows if row["kind"] == kind and np.isfinite(row[name])]
+            stems = np.array([sign * row[name] for row in known if row["is_stem"]])
+            leaves = [[sign * row[name] for row in known if not row["is_stem"] and row["family"] in of]
+                      for of in ((*PHYLLOTAXIS, "fern"), HARD)]  # fmt: skip
+            curve = [np.mean(stems[:, None] > np.array(each)) + np.mean(stems[:, None] == np.array(each)) / 2
+                     for each in leaves]  # fmt: skip
+            print(f"| {kind} | {name} | {curve[0]:.3f} | {curve[1]:.3f} | {len(stems)} | {len(leaves[0])} |")
+    features = np.array([
+        (row["gain"], *(row[name] if np.isfinite(row[name]) else other
+                        for name, other in zip(("width_change", "aspect"), UNKNOWN, strict=True)), 1)
+        for row in rows if np.isfinite(row["gain"])
+    ])  # fmt: skip
+    features[:, 2] = np.log(features[:, 2])
+    is_stem = np.array([row["is_stem"] for row in rows if np.isfinite(row["gain"])])
+    side, spread = np.where(is_stem, 1, -1), features.std(0)
+
+    def loss(weights: np.ndarray) -> float:
+        misses = np.logaddexp(0, -side * (features @ weights))
+        return float(misses.sum() + 0.1 * ((weights * spread) ** 2).sum())
+
+    print("weights:", np.round(minimize(loss, np.zeros(4)).x, 2).tolist())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
+    parser.add_argument("--plants", type=int, default=6, help="of each family")
+    parser.add_argument("--evidence", action="store_true", help="tell stems from leaves")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    if args.evidence:
+        print_evidence(args.plants)
+    else:
+        print_nodes(args.cache, args.plants)
+
+
+if __name__ == "__main__":
+    main()

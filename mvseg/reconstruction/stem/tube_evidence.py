@@ -1,0 +1,152 @@
+"""Tube against patch: evidence that a candidate is a stem, not a leaf.
+
+A leaf changes its apparent width as one walks round it; a stem does not. And a flat patch explains the masks of a stem
+worse than a tube does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from mvseg.reconstruction.numbers import FIT, TUBE
+from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.stem.fit_tube import apparent_widths, believe_offsets, fit_tube, midrib_of
+from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.surface.fit_surfaces import instance_frames, stack_instance
+from mvseg.reconstruction.surface.leaf_patch import Floats
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
+from mvseg.reconstruction.surface.mask_stack import MaskStack
+from mvseg.reconstruction.surface.patch_image import view_ious
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+# fitted: python benchmarks/stems.py --cache DIR --plants 2 --evidence (gain, change, log(aspect), 1)
+WEIGHTS = (31.4, -6.4, 1.39, -3.3)
+UNKNOWN = (0.3, 8.0)  # chosen: width change and aspect where the views do not tell
+
+
+@dataclass(frozen=True, eq=False)
+class TubeEvidence:
+    """Evidence that a candidate is a stem; NaN where the views do not tell.
+
+    Attributes:
+        tube: the tube that explains its masks.
+        tube_iou: median IoU of the tube and the masks.
+        patch_iou: the same of its surface, on the same pixels.
+        width_change: by how much the widths that different views show of the same place differ: standard deviation of
+            their logarithms, median along the tube, without what pixels, and masks that are too large or small as a
+            whole, explain. About 0 for stems.
+        width: median over places and views, world units.
+        length: along the tube, world units.
+    """
+
+    tube: Tube
+    tube_iou: float
+    patch_iou: float
+    width_change: float
+    width: float
+    length: float
+
+    @property
+    def gain(self) -> float:
+        """IoU by which the tube explains the masks better than the patch does; negative for leaves."""
+        return self.tube_iou - self.patch_iou
+
+    @property
+    def aspect(self) -> float:
+        """Length over width."""
+        return self.length / self.width if self.width > 0 else float("nan")
+
+    @property
+    def probability(self) -> float:
+        """How likely the candidate is a stem, where there are eight leaves to a stem."""
+        change = self.width_change if np.isfinite(self.width_change) else UNKNOWN[0]
+        aspect = self.aspect if np.isfinite(self.aspect) else UNKNOWN[1]
+        gain = self.gain if np.isfinite(self.gain) else -1.0
+        logit = float(np.dot(WEIGHTS, (gain, change, np.log(aspect), 1.0)))
+        return float(1 / (1 + np.exp(-logit)))
+
+
+def tube_evidence(
+    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, surfaces: Mapping[int, LeafSurface]
+) -> dict[int, TubeEvidence]:
+    """Fit a tube to every instance that has a surface, and compare the two.
+
+    Args:
+        regions: D regions. Those matched to nothing hide others as well.
+        instance_ids: (D,) int64, from 1 on; -1 = no instance.
+        cameras: V cameras.
+        surfaces: {instance id: surface}; rough ones will do.
+
+    Returns:
+        {instance id: evidence} of those that have a surface.
+    """
+    if not any(surface.exists for surface in surfaces.values()):
+        return {}
+    regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
+    frames = instance_frames(regions, instance_ids, cameras)
+    offsets = [each.offsets_px[each.offsets_px.isfinite()].numpy() for each in surfaces.values() if each.exists]
+    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
+    sd_px, found = 0.0 if errors is None else errors.sd_px, {}
+    for instance, surface in sorted(surfaces.items()):
+        if not surface.exists:
+            continue
+        members = regions.select((instance_ids == instance) & (regions.areas > 0))
+        views = members.view_index.unique()
+        if len(views) < 2:
+            continue
+        chosen = views[spread_views(cameras[views], TUBE.most_views)]
+        members = members.select((members.view_index[:, None] == chosen).any(1))
+        masks = stack_instance(members, cameras, frames, instance=instance)
+        found[instance] = compare_tube(masks, surface, mask_sd_px=sd_px)
+    return found
+
+
+def compare_tube(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float = 0.0) -> TubeEvidence:
+    """The evidence of the masks of one candidate with a surface.
+
+    Args:
+        masks: of the candidate.
+        surface: that exists.
+        mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large.
+    """
+    coefficients = surface.coefficients.numpy()
+    tube = fit_tube(masks, midrib_of(coefficients), mask_sd_px=mask_sd_px)
+    patch = float(np.median(patch_ious(masks, surface, mask_sd_px=mask_sd_px)))
+    if not tube.exists:
+        nan = float("nan")
+        return TubeEvidence(tube, nan, patch, nan, nan, nan)
+    change, width = width_change(masks, tube, mask_sd_px=mask_sd_px)
+    return TubeEvidence(tube, float(np.median(tube.iou)), patch, change, width, tube.length)
+
+
+def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> Floats:
+    """(S,) IoU of a surface and the mask in each view, drawn as much too large or small as the mask is believed to be,
+    as `Tube.iou` is."""
+    offsets_of = dict(zip(surface.views.tolist(), surface.offsets_px.tolist(), strict=False))
+    measured = np.array([offsets_of.get(view, np.nan) for view in masks.views.tolist()])
+    offsets = believe_offsets(measured, mask_sd_px / masks.pixel_size)
+    return view_ious(masks, surface.points(*FIT.grid).numpy(), offsets=offsets)
+
+
+def width_change(masks: MaskStack, tube: Tube, *, mask_sd_px: float) -> tuple[float, float]:
+    """How much the apparent width differs between views (see `TubeEvidence`), and its median.
+
+    NaN where no place is seen by `TUBE.least_views` views.
+    """
+    widths, pixels = apparent_widths(masks, tube.axis)
+    is_seen = np.isfinite(widths)
+    places = is_seen.sum(0) >= TUBE.least_views
+    if not places.any():
+        return float("nan"), float("nan")
+    logs = np.log(widths[:, places])
+    # Masks that are too large as a whole are so on both sides.
+    sd_px = max(TUBE.width_noise_px, 2 * mask_sd_px / masks.pixel_size)
+    noise = (sd_px / np.maximum(pixels[:, places], 1)) ** 2
+    change = np.nanvar(logs, axis=0, ddof=1) - np.nanmean(np.where(is_seen[:, places], noise, np.nan), axis=0)
+    return float(np.sqrt(max(np.median(change), 0))), float(np.nanmedian(widths[:, places]))

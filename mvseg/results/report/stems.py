@@ -1,0 +1,56 @@
+"""Stems on the page: lines in the photos, and the nodes of the diagram."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mvseg.formats.text_file import format_number
+from mvseg.results.report.pictures import UNITS, Picture
+from mvseg.results.result import Result
+from mvseg.results.stem_shapes import StemPart, stem_parts
+
+
+def parts_of(result: Result) -> list[StemPart]:
+    """The stems and petioles of a result; none without traits."""
+    stems = () if result.traits is None else result.traits.stems
+    return [part for stem in stems for part in stem_parts(stem)]
+
+
+def draw_lines(result: Result, view: int, picture: Picture) -> list[dict[str, Any]]:
+    """Stems and petioles in one photo: paths of SVG in the units of its picture, and the leaf of a petiole."""
+    width, height = result.scene.cameras.sizes[view].tolist()
+    px_from_world = result.scene.cameras.px_from_world[view].cpu().numpy()
+    corner = np.array(picture.box[:2]) * (width, height)
+    scale = UNITS / ((picture.box[2] - picture.box[0]) * width)
+    lines = []
+    for part in parts_of(result):
+        cam = part.points @ px_from_world[:, :3].T + px_from_world[:, 3]
+        if (cam[:, 2] > 0).all():
+            places = np.round((cam[:, :2] / cam[:, 2:] - corner) * scale).astype(int).tolist()
+            path = "M" + "L".join(f"{x} {y}" for x, y in places)
+            lines.append({"path": path} | ({} if part.leaf is None else {"leaf": part.leaf}))
+    return lines
+
+
+def describe_stems(result: Result) -> list[dict[str, Any]]:
+    """One entry per stem: what showed it, the phyllotaxis that it suggests, and its nodes, upwards."""
+    found = []
+    for stem in () if result.traits is None else result.traits.stems:
+        suggested = stem.phyllotaxis
+        nodes = [
+            {"leaf": node.leaf, "height": _rounded(node.height.value), "azimuth": _rounded(node.azimuth.value)}
+            for node in stem.nodes
+        ]
+        about: dict[str, Any] = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
+        if np.isfinite(suggested.probability):
+            about["probability"] = round(suggested.probability, 3)
+        if np.isfinite(suggested.angle):
+            about["angle"] = suggested.angle
+        found.append(about)
+    return found
+
+
+def _rounded(value: float) -> float | None:
+    return float(format_number(value)) if np.isfinite(value) else None

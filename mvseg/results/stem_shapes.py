@@ -1,0 +1,53 @@
+"""Stems and petioles as they are drawn: tubes in space, lines in photos."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from mvseg.reconstruction.stem.tube import sweep_circle
+from mvseg.traits.nodes import Stem
+
+STEM_COLOR, PETIOLE_COLOR = (126, 104, 66), (170, 176, 120)  # definition: of stems, and of petioles, which are guessed
+STEM_WIDTH, PETIOLE_WIDTH = 0.012, 0.006  # definition: radius where it is not known, in lengths of the stem
+
+
+@dataclass(frozen=True, eq=False)
+class StemPart:
+    """A stem, or the petiole of a leaf.
+
+    Attributes:
+        name: of its node in glTF.
+        leaf: that a petiole leads to; None for a stem.
+        points: (P, 3) along it.
+        radius: (P,).
+        color: RGB, 0 to 255.
+    """
+
+    name: str
+    leaf: int | None
+    points: NDArray[np.float64]
+    radius: NDArray[np.float64]
+    color: tuple[int, int, int]
+
+    def mesh(self) -> trimesh.Trimesh:
+        """A closed tube."""
+        return sweep_circle(self.points, self.radius)
+
+
+def stem_parts(stem: Stem) -> Iterator[StemPart]:
+    """The tube of a stem, and thin straight ones from its nodes to the blades: where petioles run is a guess."""
+    points = stem.tube.points()
+    length = max(stem.tube.length, 1e-300)
+    radius = np.maximum(stem.tube.radius(), 0)
+    known = radius if radius.any() else np.full(len(points), STEM_WIDTH * length)
+    yield StemPart(f"stem_{stem.number}", None, points, known, STEM_COLOR)
+    for node in stem.nodes:
+        ends = np.array([node.place, node.base])
+        if np.linalg.norm(ends[1] - ends[0]) > PETIOLE_WIDTH * length:
+            width = np.full(2, PETIOLE_WIDTH * length)
+            yield StemPart(f"petiole_{node.leaf:03d}", node.leaf, ends, width, PETIOLE_COLOR)

@@ -1,0 +1,229 @@
+"""The stems of a plant, from what shows it: the bases of its leaves, and thin parts in its photos."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
+from mvseg.reconstruction.numbers import AXES
+from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.stem.leaf_bases import (
+    BaseAxis,
+    LeafBases,
+    as_tube,
+    axes_of_bases,
+    choose_ends,
+    curve_of,
+    find_ends,
+    project_bases,
+)
+from mvseg.reconstruction.stem.stem_path import StemPath, find_path
+from mvseg.reconstruction.stem.thin_parts import ThinCells, ThinView, find_cells, see_thin, share_of_views
+from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+from mvseg.traits.nodes import Stem, measure_stem
+
+Floats = NDArray[np.float64]
+
+LONG = 4.0  # chosen: length over width of a surface from which it may be a stem's
+MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
+LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
+MOST_GAP = 8.5  # chosen: longest step in a petiole that was traced, in cells
+SUPPORTED = 0.5  # chosen: share of the views that show the axis of leaf bases as thin, at least, where photos exist
+LEAF_SHARE = 0.5  # chosen: leaves that sit on a path, of all, at least
+UPRIGHT = 0.3  # chosen: length of the mean of the directions that are up in the photos, for them to agree
+FAINTEST = 0.25  # chosen: part of an axis that views need not show
+LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
+
+
+def find_tubes(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras) -> dict[int, TubeEvidence]:
+    """{instance id: evidence that it is a stem} of those that are long enough to be one."""
+    long = {instance: each for instance, each in surfaces.items() if each.exists and each.length > LONG * each.width}
+    return tube_evidence(masks.regions, masks.instance_ids, cameras, surfaces=long)
+
+
+def find_stems(
+    surfaces: Mapping[int, LeafSurface],
+    masks: Masks,
+    cameras: Cameras,
+    *,
+    frame: Floats | None,
+    photos: Photos,
+    tubes: Sequence[Tube] = (),
+) -> tuple[Stem, ...]:
+    """Find the stems that the leaves of a plant sit on, and their nodes.
+
+    Masks that show stems tell best. Otherwise leaves point back to them; where photos exist, these must show something
+    thin there. Where leaves point to no stem, as those that are wider than long, the cheapest path through thin parts
+    between them is one.
+
+    Args:
+        surfaces: {instance id: credible surface} of leaves.
+        masks: D masks of the scene, with ids.
+        cameras: V cameras.
+        frame: (3, 3) rows east, north, up; None: up is not known.
+        photos: used, if they exist.
+        tubes: fitted to masks of stems.
+
+    Returns:
+        The stems, that of the most leaves first; none where leaves and views do not agree about one.
+    """
+    if not surfaces:
+        return ()
+    upward = find_upward(cameras) if frame is None else frame[2]
+    if tubes and (found := _of_tubes(tubes, surfaces, frame, upward)):
+        return found
+    axes = axes_of_bases(surfaces, upward)
+    if not photos.exist:
+        return _of_bases(axes, frame)
+    seen = see_plant(surfaces, masks, cameras, photos=photos)
+    axes = tuple(axis for axis in axes if seen.support(axis.tube.points()) >= SUPPORTED)
+    if axes:
+        return _of_bases(axes, frame)
+    path = find_path(seen.cells, seen.leaves)
+    if path is None or seen.support(path.points) < SUPPORTED:
+        return ()
+    return _of_path(path, surfaces, frame, upward)
+
+
+def find_upward(cameras: Cameras) -> Floats | None:
+    """(3,) the direction that is up in most photos, roughly that of the plant; None where these do not agree."""
+    mean = -cameras.R[:, 1].mean(0).cpu().numpy()
+    return mean / np.linalg.norm(mean) if np.linalg.norm(mean) > UPRIGHT else None
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPlant:
+    """Thin parts of a plant.
+
+    Attributes:
+        views: of `see_thin`.
+        cells: that they agree about.
+        leaves: {instance id: (P, 3) points on its surface}.
+    """
+
+    views: tuple[ThinView, ...]
+    cells: ThinCells
+    leaves: Mapping[int, Floats]
+
+    def support(self, points: Floats) -> float:
+        """How far the views show an axis (P, 3) as thin: the share of them that show most of its points so, or what is
+        within two cells of these; 0 where they hardly see any of it."""
+        shares = share_of_views(self.views, points, 3 * self.cells.size)
+        is_seen = np.isfinite(shares)
+        return float(np.quantile(shares[is_seen], FAINTEST)) if is_seen.mean() > LEAST_SEEN else 0.0
+
+
+def see_plant(
+    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
+) -> SeenPlant:
+    """Look for thin parts around the leaves, in some of the photos."""
+    leaves = {leaf: surface.points(*LEAF_GRID).reshape(-1, 3).numpy() for leaf, surface in surfaces.items()}
+    points = np.concatenate(list(leaves.values()))
+    cameras = cameras.to("cpu")
+    px_from_world = cameras.px_from_world.numpy()
+    views = []
+    for view in spread_views(cameras, MOST_VIEWS).tolist():
+        is_leaf = masks.regions.label_map(view, masks.instance_ids.clamp(min=0), cameras.sizes[view].tolist()) > 0
+        views.append(see_thin(photos(view), is_leaf.cpu().numpy(), px_from_world[view], points))
+    axes = np.linalg.svd(points - points.mean(0), full_matrices=False)[2]
+    return SeenPlant(tuple(views), find_cells(views, points, axes), leaves)
+
+
+def _of_tubes(
+    tubes: Sequence[Tube], surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
+) -> tuple[Stem, ...]:
+    """The stems that masks show, each with the leaves that point back to it rather than to another one."""
+    ends, others = find_ends(surfaces)
+    size = float(np.median(ends.lengths))
+    upright = [tube.reverse() if _is_reversed(tube, upward, ends) else tube for tube in tubes]
+    nearer = [choose_ends(ends, others, curve_of(tube)) for tube in upright]
+    gaps = np.array([project_bases(bases, curve_of(tube))[1] for bases, tube in zip(nearer, upright, strict=True)])
+    of_leaf = np.where(gaps.min(0) < AXES.near * size, gaps.argmin(0), -1)
+    own = [bases.select(of_leaf == number) for number, bases in enumerate(nearer)]
+    found = sorted(zip(upright, own, strict=True), key=lambda each: -len(each[1]))
+    return tuple(
+        measure_stem(tube, bases, frame=frame, source="masks", number=number)
+        for number, (tube, bases) in enumerate(found, start=1)
+        if len(bases)
+    )
+
+
+def _is_reversed(tube: Tube, upward: Floats | None, leaves: LeafBases) -> bool:
+    """Does a tube lead downwards, or, where up is not known, away from most leaves?"""
+    first, last = tube.points()[[0, -1]]
+    if upward is not None:
+        return bool((last - first) @ upward < 0)
+    below, above = (float(np.median(np.linalg.norm(leaves.points - end, axis=1))) for end in (first, last))
+    return below < above
+
+
+def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None) -> tuple[Stem, ...]:
+    """The stems of axes; a leaf sits on one of them."""
+    return tuple(
+        measure_stem(axis.tube, axis.bases.select(axis.is_near), frame=frame, source="leaf bases", number=number)
+        for number, axis in enumerate(axes, start=1)
+    )
+
+
+def _of_path(
+    path: StemPath, surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
+) -> tuple[Stem, ...]:
+    """The stem of a path, if it has enough leaves.
+
+    Petioles that were traced tell the nodes, whichever end of a leaf is its base; of the other leaves the midribs do,
+    where they point back to the path.
+    """
+    ends, others = find_ends(surfaces)
+    rising = (ends.points + others.points).mean(0) / 2 - path.points[0] if upward is None else upward
+    line = path.points if (path.points[-1] - path.points[0]) @ rising >= 0 else path.points[::-1]
+    tube = as_tube(line, np.full(len(path.petioles) + 2, path.miss))
+    traced = petiole_bases(path, surfaces)
+    nearer = choose_ends(ends, others, line)
+    nearer = nearer.select(~np.isin(nearer.ids, traced.ids))
+    _, gap, _ = project_bases(nearer, curve_of(tube))
+    bases = LeafBases.join(traced, nearer.select(gap < AXES.near * np.median(ends.lengths)))
+    _, _, along = project_bases(bases, curve_of(tube))
+    num_places = 1 + int((np.diff(np.sort(along)) > 2 * path.cell).sum()) if len(along) else 0
+    if len(bases) < LEAF_SHARE * len(surfaces) or num_places < AXES.least_leaves:
+        return ()
+    return (measure_stem(tube, bases, frame=frame, source="photos"),)
+
+
+def petiole_bases(path: StemPath, surfaces: Mapping[int, LeafSurface]) -> LeafBases:
+    """The bases of leaves whose petioles were traced without a long gap: where they join the stem, and their direction
+    there."""
+    ids = [leaf for leaf, way in path.petioles.items() if _longest_step(way) <= MOST_GAP * path.cell]
+    starts, ahead, near = [], [], []
+    for leaf in ids:
+        way = path.petioles[leaf]
+        middle = surfaces[leaf].points(*LEAF_GRID).reshape(-1, 3).numpy().mean(0)
+        along = np.append(0, np.linalg.norm(np.diff(way, axis=0), axis=1).cumsum())
+        lever = np.linalg.norm(middle - way[0]) / 4
+        begin = np.array([np.interp(min(lever, along[-1]), along, axis) for axis in way.T])
+        direction = (begin if along[-1] > lever else middle) - way[0]
+        starts.append(way[0])
+        ahead.append(direction / max(float(np.linalg.norm(direction)), 1e-300))
+        near.append(way[0] + direction)
+    num = len(ids)
+    return LeafBases(
+        ids=np.array(ids, np.int64),
+        points=np.array(starts).reshape(num, 3),
+        ahead=np.array(ahead).reshape(num, 3),
+        near=np.array(near).reshape(num, 3),
+        lengths=np.array([surfaces[leaf].length for leaf in ids]),
+        point_sd=np.full(num, path.cell),
+        angle_sd=np.zeros(num),
+        is_reversed=np.zeros(num, bool),
+    )
+
+
+def _longest_step(way: Floats) -> float:
+    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0))

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from known_leaves import bent_blade, move, turn_about
+from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
+from mvseg.results.stem_shapes import PETIOLE_COLOR, STEM_COLOR, stem_parts
+from mvseg.traits.nodes import Stem, measure_stem
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def stem() -> Stem:
+    leaves = {n + 1: move(bent_blade(), turn_about(UP, 137.5 * n), shift=(0, 0, 20.0 * n)) for n in range(5)}
+    leaves = {leaf: move(each, np.eye(3), shift=tuple(9 * each.midrib[5].numpy() * [1, 1, 0] / 9))
+              for leaf, each in leaves.items()}  # fmt: skip
+    (axis,) = axes_of_bases(leaves, UP)
+    return measure_stem(axis.tube, axis.bases, frame=None, source="leaf bases")
+
+
+def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -> None:
+    trunk, *petioles = stem_parts(stem)
+    assert (trunk.name, trunk.leaf, trunk.color) == ("stem_1", None, STEM_COLOR)
+    assert {part.name for part in petioles} == {f"petiole_{part.leaf:03d}" for part in petioles}
+    assert len(petioles) >= 3
+    for part in petioles:
+        node = next(each for each in stem.nodes if each.leaf == part.leaf)
+        assert part.color == PETIOLE_COLOR
+        assert part.points.tolist() == [list(node.place), list(node.base)]
+    for part in (trunk, *petioles):
+        assert part.mesh().is_watertight
+        assert part.mesh().volume > 0
+
+
+def test_a_radius_that_is_known_is_drawn(stem: Stem) -> None:
+    thick = replace(stem, tube=replace(stem.tube, radii=np.full(3, 4.0)))
+    (trunk, *_) = stem_parts(thick)
+    assert trunk.radius == pytest.approx(4.0)
+    assert trunk.mesh().volume == pytest.approx(np.pi * 16 * stem.tube.length, rel=0.08)

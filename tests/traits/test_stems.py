@@ -1,0 +1,230 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from blade_scene import SIZE, ring_cameras
+from known_leaves import bent_blade, move, turn_about
+from mvseg.errors import InputError
+from mvseg.masks import Masks
+from mvseg.reconstruction.stem.fit_tube import fit_tube
+from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
+from mvseg.reconstruction.stem.stem_path import find_path
+from mvseg.reconstruction.stem.thin_parts import find_cells, see_thin
+from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import regions_from_label_maps
+from mvseg.traits.measure import Traits
+from mvseg.traits.nodes import Stem
+from mvseg.traits.stems import find_stems
+from mvseg.traits.table import read_nodes, write_nodes
+from mvseg.traits.up import level_frame
+from tube_scene import BENT, T, stack, tube_masks
+
+UP = np.array([0.0, 0.0, 1.0])
+CAMERAS = ring_cameras(8, distance=600.0)
+PETIOLE = 9.0
+
+
+class NoPhotos:
+    exist = False
+
+
+def leaf_at(height: float, azimuth: float, *, petiole: float = PETIOLE, x: float = 0.0) -> LeafSurface:
+    """A leaf of 40 that leaves a vertical stem at x; its petiole rises by 7 degrees, as its chord does."""
+    out = petiole * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), np.tan(np.radians(7))])
+    return move(bent_blade(), turn_about(UP, azimuth), shift=(out[0] + x, out[1], out[2] + height))
+
+
+def plant_of(azimuths: Callable[[int], float], heights: Callable[[int], float]) -> dict[int, LeafSurface]:
+    """Eight leaves with mixed ids."""
+    return {(5 * n) % 11 + 1: leaf_at(heights(n), azimuths(n)) for n in range(8)}
+
+
+def stems_of(leaves: dict[int, LeafSurface], up: np.ndarray | None = UP) -> tuple[Stem, ...]:
+    regions = regions_from_label_maps([np.zeros((SIZE, SIZE), np.int64)] * len(CAMERAS))
+    frame = None if up is None else level_frame(up)
+    return find_stems(leaves, Masks.of(regions), CAMERAS, frame=frame, photos=NoPhotos())  # type: ignore[arg-type]
+
+
+PLANTS = {
+    "distichous": (180.0, plant_of(lambda n: 30 + 180 * n, lambda n: 20.0 * n)),
+    "spiral": (137.5, plant_of(lambda n: 30 - 137.5 * n, lambda n: 20.0 * n)),
+    "decussate": (90.0, plant_of(lambda n: 10 + 180 * (n % 2) + 90 * (n // 2), lambda n: 30.0 * (n // 2) + n % 2)),
+}
+
+
+@pytest.mark.parametrize("name", PLANTS)
+@pytest.mark.parametrize("up", [UP, None], ids=["up", "no up"])
+def test_leaves_are_ordered_along_their_stem(name: str, up: np.ndarray | None) -> None:
+    angle, leaves = PLANTS[name]
+    (stem,) = stems_of(leaves, up)
+    assert stem.source == "leaf bases"
+    assert (stem.phyllotaxis.name, stem.phyllotaxis.angle) == (name, angle)
+    assert stem.phyllotaxis.probability > 0.9
+    assert [node.number for node in stem.nodes] == list(range(1, 9))
+    order = [node.leaf for node in stem.nodes]
+    pairs = [{*order[n : n + 2]} for n in range(0, 8, 2)]
+    assert pairs == [{(5 * n) % 11 + 1, (5 * n + 5) % 11 + 1} for n in range(0, 8, 2)]
+    heights = [node.height.value for node in stem.nodes]
+    assert heights == sorted(heights)
+    expected = {"decussate": 30.0, "spiral": 20.0, "distichous": 20.0}[name]
+    steps = np.diff(heights[::2] if name == "decussate" else heights)
+    assert steps == pytest.approx(expected, abs=1.5)
+    assert (np.abs(np.array([node.place for node in stem.nodes])[:, :2]) < 3).all()
+    assert all(abs(node.insertion_angle.value - 90) < 12 for node in stem.nodes)
+    divergences = [node.divergence.value for node in stem.nodes[1:]]
+    if name != "decussate":
+        assert divergences == pytest.approx([angle] * 7, abs=6)
+    assert not stem.nodes[0].internode.exists
+    assert not stem.nodes[0].divergence.exists
+
+
+def test_azimuths_are_those_of_the_level_frame() -> None:
+    (stem,) = stems_of(PLANTS["spiral"][1])
+    found = [node.azimuth.value for node in stem.nodes]
+    assert np.exp(1j * np.radians(found)) == pytest.approx(
+        np.exp(1j * np.radians([30 - 137.5 * n for n in range(8)])), abs=0.1
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_turned_and_scaled_world_has_the_same_nodes(seed: int) -> None:
+    turn = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    leaves = PLANTS["spiral"][1]
+    (first,) = stems_of(leaves)
+    moved = {leaf: move(each, turn, scale=3.0, shift=(1000, -50, 7)) for leaf, each in reversed(leaves.items())}
+    (other,) = stems_of(moved, turn @ UP)
+    assert [node.leaf for node in other.nodes] == [node.leaf for node in first.nodes]
+    for one, two in zip(first.nodes, other.nodes, strict=True):
+        assert two.height.value / 3 == pytest.approx(one.height.value, abs=0.3)
+        assert two.height.sd / 3 == pytest.approx(one.height.sd, rel=0.1)
+
+
+def test_a_leaf_that_was_taken_the_wrong_way_round_is_turned() -> None:
+    from mvseg.reconstruction.surface.orientation import _transform, turn_matrix
+
+    leaves = dict(PLANTS["spiral"][1])
+    leaves[1] = _transform(leaves[1], turn_matrix())
+    (stem,) = stems_of(leaves)
+    assert len(stem.nodes) == 8
+    (axis,) = axes_of_bases(leaves, UP)
+    assert axis.bases.ids[axis.bases.is_reversed].tolist() == [1]
+
+
+def test_two_stems_have_their_own_leaves() -> None:
+    first = {n + 1: leaf_at(25.0 * n, 137.5 * n) for n in range(5)}
+    second = {n + 6: leaf_at(25.0 * n, 20 + 180.0 * n, x=180.0) for n in range(4)}
+    stems = stems_of(first | second)
+    assert [sorted(node.leaf for node in stem.nodes) for stem in stems] == [[1, 2, 3, 4, 5], [6, 7, 8, 9]]
+    assert [stem.number for stem in stems] == [1, 2]
+
+
+def test_no_stem_where_leaves_do_not_agree() -> None:
+    assert stems_of({}) == ()
+    assert stems_of({1: leaf_at(0, 0), 2: leaf_at(20, 180)}) == ()
+    rosette = {n + 1: leaf_at(0.2 * n, 137.5 * n) for n in range(8)}
+    assert stems_of(rosette) == ()
+    rng = np.random.default_rng(3)
+    turns = [turn_about(rng.normal(size=3), 360 * rng.random()) for _ in range(8)]
+    strewn = {n + 1: move(bent_blade(), turn, shift=tuple(rng.normal(0, 300, 3))) for n, turn in enumerate(turns)}
+    assert stems_of(strewn) == ()
+
+
+def test_masks_of_stems_tell_better_than_leaves() -> None:
+    """Upwards, with a radius, and heights from the foot."""
+    cameras = ring_cameras(10)
+    tube: Tube = fit_tube(stack(tube_masks(BENT, 0.06 + 0 * T), cameras))
+    leaves = {}
+    for number, place in enumerate((20, 32, 44), start=1):
+        azimuth = 100.0 * number
+        out = 0.1 * np.array([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth)), np.tan(np.radians(7))])
+        leaves[number] = move(bent_blade(), turn_about(UP, azimuth), scale=0.01, shift=tuple(BENT[place] + out))
+    regions = regions_from_label_maps([np.zeros((SIZE, SIZE), np.int64)] * len(cameras))
+    (stem,) = find_stems(
+        leaves, Masks.of(regions), cameras, frame=level_frame(UP), photos=NoPhotos(), tubes=[tube.reverse()]  # type: ignore[arg-type]
+    )
+    assert stem.source == "masks"
+    assert [node.leaf for node in stem.nodes] == [1, 2, 3]
+    along = np.append(0, np.linalg.norm(np.diff(BENT, axis=0), axis=1).cumsum())
+    assert [node.height.value for node in stem.nodes] == pytest.approx(along[[20, 32, 44]], abs=0.04)
+    assert stem.tube.points()[0, 2] < stem.tube.points()[-1, 2]
+
+
+def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
+    stems = stems_of(PLANTS["decussate"][1])
+    path = tmp_path / "nodes.csv"
+    write_nodes(path, Traits("=plant", "mm", (), {}, None, stems))
+    text = path.read_text()
+    assert text.count("\n") == 9
+    assert "\n'=plant,1,1," in text
+    (again,) = read_nodes(path)
+    assert (again.source, again.phyllotaxis.name) == ("leaf bases", "decussate")
+    for one, two in zip(stems[0].nodes, again.nodes, strict=True):
+        assert (one.leaf, one.number) == (two.leaf, two.number)
+        assert two.height.value == pytest.approx(one.height.value, abs=1e-3)
+        assert two.place == pytest.approx(one.place, abs=1e-2)
+    path.write_text(text.replace(",1,1,", ",x,1,", 1))
+    with pytest.raises(InputError, match="no table of nodes"):
+        read_nodes(path)
+
+
+def thin_photos(lines: list[np.ndarray], width: int) -> list[np.ndarray]:
+    """V photos (H, W, 3) of dark lines (P, 3) before grey."""
+    photos = []
+    for matrix in ring_cameras(10).px_from_world.numpy():
+        photo = np.full((SIZE, SIZE, 3), 150, np.uint8)
+        for line in lines:
+            cam = line @ matrix[:, :3].T + matrix[:, 3]
+            px = np.round(cam[:, :2] / cam[:, 2:] * 16 - 8).astype(np.int32)
+            cv2.polylines(photo, [px], False, (70, 90, 40), width, shift=4)
+        photos.append(photo)
+    return photos
+
+
+def test_a_path_through_thin_parts_joins_leaves_to_their_stem() -> None:
+    """Whichever way their midribs run: leaves are balls of points here."""
+    stem = np.stack([0 * T, 0.1 * T, 1.8 * T - 0.9], 1)
+    nodes, rng = {leaf: 4 + 8 * leaf for leaf in range(1, 7)}, np.random.default_rng(0)
+    petioles, leaves = [], {}
+    for leaf, place in nodes.items():
+        ahead = np.array([np.cos(2.4 * leaf), np.sin(2.4 * leaf), 0.3])
+        petioles.append(stem[place] + np.linspace(0, 0.35, 20)[:, None] * ahead)
+        leaves[leaf] = stem[place] + 0.45 * ahead + rng.uniform(-0.1, 0.1, (400, 3))
+    cameras = ring_cameras(10)
+    points = np.concatenate(list(leaves.values()))
+    views = []
+    for photo, matrix in zip(thin_photos([stem, *petioles], 2), cameras.px_from_world.numpy(), strict=True):
+        is_leaf = np.zeros((SIZE, SIZE), np.uint8)
+        for each in leaves.values():
+            cam = each @ matrix[:, :3].T + matrix[:, 3]
+            cv2.fillConvexPoly(is_leaf, cv2.convexHull((cam[:, :2] / cam[:, 2:]).astype(np.int32)), 1)
+        views.append(see_thin(photo, is_leaf > 0, matrix, points))
+    cells = find_cells(views, points, np.eye(3))
+    path = find_path(cells, leaves)
+    assert path is not None
+    away = path.points[:, :2] - np.interp(path.points[:, 2], stem[:, 2], stem[:, 1])[:, None] * [0, 1]
+    assert np.abs(away).max() < 4 * cells.size
+    assert len(path.petioles) >= 5
+    for leaf, way in path.petioles.items():
+        assert way[0, 2] == pytest.approx(stem[nodes[leaf], 2], abs=4 * cells.size), leaf
+    assert find_path(cells, {leaf: leaves[leaf] for leaf in (1, 2)}) is None
+    nothing = [see_thin(np.full((SIZE, SIZE, 3), 150, np.uint8), np.zeros((SIZE, SIZE), bool), matrix, points)
+               for matrix in cameras.px_from_world.numpy()]  # fmt: skip
+    assert find_path(find_cells(nothing, points, np.eye(3)), leaves) is None
+
+
+def test_a_leaf_along_its_stem_has_no_azimuth_but_a_height() -> None:
+    leaves = dict(PLANTS["spiral"][1])
+    leaves[11] = move(bent_blade(bend_deg=1.0), turn_about(np.array([0, -1.0, 0]), 90), shift=(0.01, 0, 150))
+    (stem,) = stems_of(leaves)
+    top = next(node for node in stem.nodes if node.leaf == 11)
+    assert top.height.exists
+    assert not top.azimuth.exists
+    assert not top.divergence.exists
+    assert stem.phyllotaxis.name in ("spiral", "unclear")

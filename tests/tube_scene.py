@@ -1,0 +1,38 @@
+"""Tubes of known axis and radius in exact masks: one ray through each pixel's centre."""
+
+from __future__ import annotations
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from blade_scene import SIZE, ring_cameras
+from mvseg.reconstruction.stem.tube import sweep_circle
+from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
+from mvseg.scene import Cameras
+
+CAMERAS = ring_cameras(10)
+T = np.linspace(0, 1, 60)
+STRAIGHT = np.stack([0 * T, 0 * T, 2 * T - 1], 1)
+BENT = np.stack([0.5 * np.sin(1.5 * T), 0.2 * T, 1.8 * T - 1], 1)
+
+
+def tube_masks(points: np.ndarray, radius: np.ndarray, cameras: Cameras = CAMERAS) -> list[np.ndarray]:
+    """V masks (H, W) bool of a tube around points (P, 3) with radii (P,)."""
+    mesh = sweep_circle(points, radius)
+    bvh = EmbreeScene(robust=True)
+    TriangleMesh(bvh, np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.int32))
+    rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
+    px = np.stack([columns.ravel(), rows.ravel(), np.ones(SIZE * SIZE)], 1)
+    masks = []
+    for matrix, center in zip(cameras.world_from_px.numpy(), cameras.centers.numpy(), strict=True):
+        rays = (px @ matrix.T).astype(np.float32)
+        face = bvh.run(np.tile(center.astype(np.float32), (len(rays), 1)), rays)
+        masks.append((face >= 0).reshape(SIZE, SIZE))
+    return masks
+
+
+def stack(masks: list[np.ndarray], cameras: Cameras = CAMERAS, others: list[np.ndarray] | None = None) -> MaskStack:
+    """The masks as a fit takes them; `others` are V frames of instances that may hide the tube."""
+    nothing = [np.zeros((SIZE, SIZE), np.int32)] * len(masks)
+    return stack_masks(masks, others or nothing, range(len(masks)), px_from_world=cameras.px_from_world.numpy())
