@@ -1,11 +1,12 @@
-"""What the views teach the detector: `python benchmarks/learn.py SCENE... [--rounds 3]`
+"""What sizes and the views bring: `python benchmarks/learn.py SCENE... [--sizes 800 400] [--rounds 3]`
 
-For each scene a table: as it is; after one, two, three rounds (each from the labels of the last, whatever E says),
-and after one round in which a person has outlined six leaves in two photos each, the largest ones that are not right;
-his masks do not count in the figures. With --next, what the weights of each round find on the next plant, as they are.
-E, the expected number of right masks, stands beside what the truth says, where
-the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: E grows by `GROWTH`.
-Weights and detections are kept in --cache.
+For each scene a table: as it is; at each of --sizes, nothing learned; after one, two, three rounds (each from the
+labels of the last, whatever the agreed area says), and after one round in which a person has outlined six leaves in two
+photos each, the largest ones that are not right; his masks do not count in the figures. With --next, what the weights
+of each round find on the next plant, as they are. The agreed area (`rate_pass`, in percent of all pixels) stands beside
+what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: it
+grows by `GROWTH`. In the end: of all pairs of rows of one scene whose MV-PQ differs by `APART` or more, how many the
+agreed area orders. Weights and detections are kept in --cache.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import argparse
 import sys
 import time
 import warnings
+from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from tempfile import NamedTemporaryFile
 from typing import Any
@@ -34,14 +37,15 @@ from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import find_in_photos
+from mvseg.pipeline.find_in_photos import find_in_photos, know, look_once
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
-HEAD = ("", "E", "stays", "MV-PQ", "right", "false", "recall", "precision", "leaves", "masks", "CPU s")
+APART = 0.02  # MV-PQ of two runs whose order counts, at least
+HEAD = ("", "agreed area", "stays", "MV-PQ", "right", "false", "recall", "precision", "leaves", "masks", "CPU s")
 
 
 def judge(masks: Masks, truth: list[Labels] | None) -> dict[str, str]:
@@ -68,10 +72,20 @@ def outline_some(known: Known, truth: list[Labels]) -> Corrections:
     return Corrections(tuple(look.outline(leaf, view) for leaf in chosen for view in best[leaf][:PHOTOS]))
 
 
-def show(name: str, known: Known, truth: list[Labels] | None, *, stays: str, begun: float) -> None:
-    row: dict[str, Any] = {"": name, "E": f"{known.expected_right:.0f}", "stays": stays}
+def show(name: str, known: Known, truth: list[Labels] | None, *, stays: str, begun: float) -> tuple[float, float]:
+    """Print a row; the agreed area and MV-PQ, NaN without a truth."""
+    area = 100 * known.agreed_area / int(known.scene.cameras.sizes.prod(1).sum())
+    row: dict[str, Any] = {"": name, "agreed area": f"{area:.2f}", "stays": stays}
     row |= judge(shape_leaves(known).masks.to("cpu"), truth) | {"CPU s": f"{time.process_time() - begun:.0f}"}
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
+    return area, float(row.get("MV-PQ", "nan"))
+
+
+def count_ordered(runs: list[tuple[float, float]]) -> tuple[int, int]:
+    """Pairs of runs of one scene, each its agreed area and MV-PQ, that the area orders as MV-PQ does; and all that
+    differ by `APART` in it."""
+    apart = [(one, other) for one, other in combinations(runs, 2) if abs(one[1] - other[1]) >= APART]
+    return sum((one[0] - other[0]) * (one[1] - other[1]) > 0 for one, other in apart), len(apart)
 
 
 def see_next(folder: Path, weights: bytes | None, name: str, *, cache: CachedDetections) -> None:
@@ -93,12 +107,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--person", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--image_size", type=int, default=None)
+    parser.add_argument("--sizes", type=int, nargs="*", default=())
     parser.add_argument("--next", type=Path, help="folder of another plant of the same species")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     np.set_printoptions(precision=3)
     warnings.simplefilter("ignore", InputWarning)
+    ordered = [0, 0]
     for folder in args.scenes:
         config = RunConfig(reconstruct=None, learn="off", detect=DetectConfig(image_size=args.image_size))
         opened, begun = open_scene(folder, None, config), time.process_time()
@@ -107,15 +123,20 @@ def main() -> None:
         truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
         print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {known.looks[0].longest} px\n")
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
-        show("as it is", known, truth, stays="", begun=begun)
+        runs = [show("as it is", known, truth, stays="", begun=begun)]
+        for size in args.sizes:
+            begun, detect = time.process_time(), replace(config.detect, image_size=size)
+            seen = know(opened, look_once(opened, detect, cache=cache, boxes=first.looks[0].boxes))
+            runs.append(show(f"at {size} px", seen, truth, stays="", begun=begun))
         if args.next is not None:
             see_next(args.next, None, "the next plant", cache=cache)
         stays = True
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), known
             known = learn(known, cache=cache, rounds=1)
-            stays = stays and known.expected_right >= GROWTH * before.expected_right
-            show(f"round {number}", known, truth, stays="yes" if stays else "no", begun=begun)
+            stays = stays and known.agreed_area >= GROWTH * before.agreed_area
+            name = f"round {number}, at {known.looks[0].longest} px"
+            runs.append(show(name, known, truth, stays="yes" if stays else "no", begun=begun))
             if args.next is not None:
                 see_next(args.next, known.learned.weights, f"the next plant, weights of round {number}", cache=cache)
         if args.person and truth is not None:
@@ -125,6 +146,8 @@ def main() -> None:
             begun = time.process_time()
             corrected = apply_edits(known, corrections)
             show("the same, and his masks", corrected, truth, stays="", begun=begun)
+        ordered = [sum(pair) for pair in zip(ordered, count_ordered(runs), strict=True)]
+    print(f"\nThe agreed area orders {ordered[0]} of {ordered[1]} pairs.")
 
 
 if __name__ == "__main__":

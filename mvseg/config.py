@@ -25,7 +25,8 @@ class RunConfig:
         reconstruct: how instances become shapes; None for ids only.
         traits: which instances count as leaves in the tables of traits.
         learn: let the views teach the detector, where it finds the masks: so many rounds at most, or "off"; "auto" does
-            where most leaves score less than the detector is sure of, as those of a species that it has not seen.
+            where the detector does not know the species: most leaves score less than it is sure of, or the views choose
+            a smaller size than its own.
         views: take so many views, evenly spread by direction around what the cameras look at; "all" for all; None for
             all where masks are given, and `ENOUGH_VIEWS` otherwise. Views that corrections name are taken besides.
         scale: factor of all lengths of the world; None for 1. Cameras that state their unit need `unit` with it.

@@ -117,7 +117,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 41_700, "benchmarks": 6_650, "tests": 35_900}
+BUDGET = {"mvseg": 41_850, "benchmarks": 6_650, "tests": 36_050}
 SLACK = 400
 
 

@@ -16,6 +16,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, Reject
 from mvseg.demo import demo_scene
 from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks, Origin
@@ -30,10 +31,12 @@ from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
 from mvseg.training.view_labels import ViewLabels
 
+SIZE = 96
+
 
 @pytest.fixture(scope="module")
 def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
-    return write_leafy_scene(tmp_path_factory.mktemp("leafy"), num_leaves=4, num_views=4, size=96, span_deg=180)
+    return write_leafy_scene(tmp_path_factory.mktemp("leafy"), num_leaves=4, num_views=4, size=SIZE, span_deg=180)
 
 
 SEEN: dict[tuple[float, int], Known] = {}  # by the scores and the number of leaves
@@ -47,7 +50,8 @@ def see(
     ids = regions.labels
     scores = torch.full((len(ids),), score)
     masks = Masks.of(regions, ids, torch.ones(len(ids)), detection_scores=scores, origin=Origin.DETECTED)
-    see_masks(monkeypatch, FoundMasks.of(Matching(masks, MatchReport("nview", has_probabilities=True))))
+    look = FoundMasks.of(Matching(masks, MatchReport("nview", has_probabilities=True)))
+    see_masks(monkeypatch, replace(look, longest=SIZE))
     if (score, leaves) not in SEEN:
         SEEN[score, leaves] = find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None)))
     known = SEEN[score, leaves]
@@ -55,12 +59,12 @@ def see(
 
 
 def teach(monkeypatch: pytest.MonkeyPatch, *growth: float) -> list[ViewLabels]:
-    """Each round makes E so many times as large as it was; the labels that were learned."""
+    """Each round makes the agreed area so many times as large as it was; the labels that were learned."""
     taught: list[ViewLabels] = []
 
     def learn_once(known: Known, labels: ViewLabels, _: CachedDetections) -> Known:
         taught.append(labels)
-        grown = 0.9 * torch.tensor(growth[: len(taught)]).prod()  # P was 1
+        grown = 0.5 * torch.tensor(growth[: len(taught)]).prod().sqrt()  # the area grows with the square of P
         chances = {each: float(grown) for each in known.instances.probabilities}
         seen = replace(known, instances=replace(known.instances, probabilities=chances))
         return replace(seen, learned=Learned(weights=f"weights {len(taught)}".encode()))
@@ -70,7 +74,7 @@ def teach(monkeypatch: pytest.MonkeyPatch, *growth: float) -> list[ViewLabels]:
 
 
 def lower(known: Known, chance: float = 0.9) -> Known:
-    """So that E can grow."""
+    """So that the agreed area can grow."""
     chances = dict.fromkeys(known.instances.probabilities, chance)
     return replace(known, instances=replace(known.instances, probabilities=chances))
 
@@ -78,15 +82,15 @@ def lower(known: Known, chance: float = 0.9) -> Known:
 @pytest.mark.parametrize(
     ("rounds", "growth", "tried", "kept"),
     [
-        (1, (1.25, 1.25), 1, 1),
-        (3, (1.25, 1.25, 1.15), 3, 2),  # the third grows by too little
+        (1, (1.2, 1.2), 1, 1),
+        (3, (1.2, 1.2, 1.05), 3, 2),  # the third grows by too little
         (3, (1.05, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
-        ("off", (1.25,), 0, 0),
-        ("auto", (1.25, 1.25, 1.25, 1.25), 3, 3),
+        ("off", (1.2,), 0, 0),
+        ("auto", (1.2, 1.2, 1.2, 1.2), 3, 3),
     ],
 )
-def test_weights_stay_where_the_expected_number_of_right_masks_grows(
+def test_weights_stay_where_the_agreed_area_grows(
     leafy: LeafyScene,
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
@@ -95,14 +99,14 @@ def test_weights_stay_where_the_expected_number_of_right_masks_grows(
     tried: int,
     kept: int,
 ) -> None:
-    known = lower(see(leafy, monkeypatch, learn=rounds))
+    known = lower(see(leafy, monkeypatch, learn=rounds), 0.5)
     taught = teach(monkeypatch, *growth)
     seen = learn(known, cache=CachedDetections(tmp_path))
     assert len(taught) == tried
     assert seen.learned.rounds == kept
     assert seen.learned.weights == (f"weights {kept}".encode() if kept else None)
-    assert len(seen.learned.expected_right) == tried + 1
-    assert seen.expected_right == pytest.approx(max(seen.learned.expected_right[: kept + 1]))
+    assert len(seen.learned.agreed_area) == tried + 1
+    assert seen.agreed_area == pytest.approx(max(seen.learned.agreed_area[: kept + 1]))
     if not kept:
         assert torch.equal(seen.masks.instance_ids, known.masks.instance_ids)
 
@@ -112,10 +116,13 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
 ) -> None:
     taught = teach(monkeypatch, 1.0)
     known = see(leafy, monkeypatch, score=0.6)
-    assert learn(known, cache=CachedDetections(tmp_path)).learned == Learned(expected_right=(known.expected_right,))
+    assert learn(known, cache=CachedDetections(tmp_path)).learned == Learned(agreed_area=(known.agreed_area,))
     assert not taught
     learn(see(leafy, monkeypatch, score=0.6, learn=1), cache=CachedDetections(tmp_path))
     assert len(taught) == 1
+    smaller = replace(known, looks=(replace(known.looks[0], longest=round(SIZE * DETECTION.size_step)),))
+    learn(smaller, cache=CachedDetections(tmp_path))
+    assert len(taught) == 2  # the detector sees the leaves best at another size than its own
     with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):
         RunConfig(learn=0)
 
@@ -127,7 +134,7 @@ def test_plants_that_the_shipped_detector_knows_are_not_learned(plant: str, shar
     folder = demo_scene() if plant == "demo_plant" else shared_data / plant
     cache = CachedDetections(tmp_path)
     known = find_in_photos(open_scene(folder, None, RunConfig(reconstruct=None)), cache=cache)
-    assert len(learn(known, cache=cache).learned.expected_right) == 1
+    assert len(learn(known, cache=cache).learned.agreed_area) == 1
 
 
 @pytest.mark.parametrize("reason", ["few", "interrupt", "fails"])
@@ -146,7 +153,7 @@ def test_what_was_there_stays_and_one_sentence_says_why(
     }
     with pytest.warns(InputWarning, match=said[reason]):
         seen = learn(known, cache=CachedDetections(tmp_path))
-    assert seen.expected_right == known.expected_right
+    assert seen.agreed_area == known.agreed_area
     assert seen.learned.weights is None
 
 
@@ -172,7 +179,8 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
 
     monkeypatch.setattr(module, "_fine_tune", fine_tune)
     monkeypatch.setattr(module, "_describe", lambda *_: "the same")
-    monkeypatch.setattr(module, "look_once", lambda *_, **__: FoundMasks)
+    monkeypatch.setattr(module, "_at_size", lambda path, _: path.read_bytes())
+    monkeypatch.setattr(module, "look_near", lambda *_, **__: known)
     monkeypatch.setattr(module, "know", lambda *_, **__: known)
     for _ in range(2):
         seen = learn(lower(known, 0.5), cache=CachedDetections(tmp_path / "kept"))
@@ -183,4 +191,4 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
     assert weights_path(str(tmp_path / "out")) == tmp_path / "out" / "detector.safetensors"
     said = json.loads((tmp_path / "out" / "run.json").read_text())["learned"]
     assert said["rounds"] == 1
-    assert len(said["expected_right"]) == 2
+    assert len(said["agreed_area"]) == 2

@@ -348,7 +348,7 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
         return Leaves(matched, {}, {}, ())
 
     monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
-    config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(verify=verifies))
+    config = replace(IDS_ONLY, split_merged=True, learn="off", detect=DetectConfig(verify=verifies))
     result = run_scene(plant, None, config)
     assert len(result.masks) == len(regions) + 1
     assert result.masks.merged == ()

@@ -1,8 +1,8 @@
 """At which size the detector sees the leaves of a plant best: the views decide.
 
 A detector knows leaves of some sizes in pixels. Which those are on a new plant, its scores do not tell; whether the
-views agree does. E, the number of masks that are expected to be right (`Found.expected_right`), orders sizes as the
-truth does (docs/notes/detector.md). Not in the paper.
+views agree does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md). Not in
+the paper.
 """
 
 from __future__ import annotations
@@ -14,19 +14,35 @@ from mvseg.detection.numbers import DETECTION
 
 
 def choose_size(see: Callable[[int], Found], first: Found) -> Found:
-    """Look again and again at a smaller size, as long as more masks are expected to be right.
+    """Look again and again at a smaller size, as long as the agreed area grows.
 
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
         first: what was found at the usual size.
 
     Returns:
-        What was found where most masks are expected to be right; of equals, at the larger size.
+        What was found where the agreed area is largest; of equals, at the larger size.
     """
     best, size = first, float(first.looks[0].longest)
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
         found = see(round(size))
-        if found.expected_right <= best.expected_right:
+        if found.agreed_area <= best.agreed_area:
             return best
         best = found
     return best
+
+
+def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> Found:
+    """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
+
+    Args:
+        see: finds leaves at a size, see `choose_size`.
+        size: pixels.
+        most: pixels, the longer side of the photos: no size is larger.
+
+    Returns:
+        What was found where the agreed area is largest; of equals, at the given size.
+    """
+    larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
+    sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
+    return max(map(see, sizes), key=lambda found: found.agreed_area)

@@ -22,8 +22,7 @@ class DetectConfig:
         min_score: proposals that score less are not matched at first; in [0, 1]. The score is the detector's confidence
             that it sees a leaf, times the expected IoU of its mask. Without `verify`, they are discarded.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
-            size given with the weights, smaller ones stay as they are; where the plant fills the photos, or most leaves
-            score low, smaller sizes are tried, and the views decide.
+            size given with the weights, smaller ones stay as they are; smaller sizes are tried, and the views decide.
         crop: auto: where the plant fills a small part of large photos, a second pass runs on their parts that show
             it: leaves are seen larger. off: one pass over whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.

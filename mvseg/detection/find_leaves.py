@@ -21,8 +21,7 @@ from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
 from mvseg.verification.choose import Leaves, choose_leaves
-from mvseg.verification.leaf_scores import expect_right
-from mvseg.verification.unexplained import is_familiar
+from mvseg.verification.leaf_scores import rate_pass
 
 
 class Detector(Protocol):
@@ -119,15 +118,9 @@ class Found:
     said: tuple[str, ...] = ()
 
     @property
-    def is_familiar(self) -> bool:
-        """Whether the detector knows the species, see `mvseg.verification.unexplained.is_familiar`."""
-        return is_familiar(self.leaves.masks, sure_score=DETECTION.sure_score)
-
-    @property
-    def expected_right(self) -> float:
-        """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks. It orders
-        detectors and sizes, for one plant, as the truth does (docs/notes/detector.md)."""
-        return expect_right(self.leaves.masks, self.leaves.probabilities)
+    def agreed_area(self) -> float:
+        """Pixels, see `rate_pass`."""
+        return rate_pass(self.leaves.masks, self.leaves.probabilities)
 
 
 def find_leaves(

@@ -21,6 +21,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
+from mvseg.verification.missing_parts import find_missing_parts
 from mvseg.verification.snap_edges import snap_masks
 
 
@@ -151,7 +152,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         posed = cameras.to("cpu")
         look = Look.of(self, detections, posed, min_score=config.min_score)
         leaves = find_leaves([look], posed, config=config).leaves
-        return _said_of(look.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__))
+        missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
+        return _said_of(look.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:

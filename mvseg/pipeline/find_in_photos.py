@@ -4,26 +4,30 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.choose_size import choose_size
+from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
+from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.find_leaves import Found, Look, find_leaves
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
+from mvseg.reconstruction.spread_views import spread_views
 from mvseg.results.result import Instances
 
 
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Known:
     """Look for leaves in the photos; the views choose leaves and masks.
 
-    Where the plant fills the photos, or the detector does not know its species, it looks at several sizes, unless one
-    is given: see `choose_size`.
+    The detector looks at several sizes, unless one is given: see `choose_size`. With twice as many photos as
+    `DETECTION.judging_views`, or more, so many of them choose the size.
 
     Args:
         opened: the scene.
@@ -33,18 +37,52 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
         InputError: see `detect_scene`.
     """
     detect = opened.config.detect
-    with collect_warnings() as said:
-        look = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache)
-        found = _choose(opened, look, detect)
-    found = replace(found, said=tuple(said))
-    boxes = found.looks[0].boxes
-    if detect.image_size is None and opened.is_chosen and (boxes is None or not found.is_familiar):
+    if detect.image_size is not None or not opened.is_chosen:
+        return know(opened, look_once(opened, detect, cache=cache))
+    few, views = _thin(opened)
+    first = look_once(few, detect, cache=cache)
+    boxes = first.looks[0].boxes
 
-        def see(size: int) -> Found:
-            return look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes)
+    def see(size: int) -> Found:
+        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=boxes)
 
-        found = choose_size(see, found)
-    return know(opened, found)
+    found = choose_size(see, first)
+    if few is opened:
+        return know(opened, found)
+    if boxes is not None:
+        masks, cameras = first.looks[0].sure.masks, opened.scene.cameras
+        regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
+        boxes = plant_boxes(replace(masks, regions=regions), cameras)
+    size = None if found is first else found.looks[0].longest
+    return know(opened, look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes))
+
+
+def _thin(opened: Opened) -> tuple[Opened, Tensor]:
+    """The scene with the views that choose the size, and their indices (S,)."""
+    cameras, most = opened.scene.cameras, DETECTION.judging_views
+    if len(cameras) < 2 * most:
+        return opened, torch.arange(len(cameras))
+    views = spread_views(cameras, most)
+    scene = opened.scene.select(views)
+    return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
+
+
+def look_near(opened: Opened, detect: DetectConfig, *, cache: CachedDetections | None, earlier: Look) -> Found:
+    """What weights find that have learned at the size of an earlier look: there, or at the size next to it where the
+    views agree better, see `choose_near`; there alone where a size is given."""
+    boxes, few, views = earlier.boxes, *_thin(opened)
+    if detect.image_size is not None:
+        return look_once(opened, detect, cache=cache, boxes=boxes)
+
+    def see(size: int) -> Found:
+        part = None if boxes is None else boxes[views]
+        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=part)
+
+    sides = opened.scene.cameras.sizes if boxes is None else boxes[:, 2:] - boxes[:, :2]
+    found = choose_near(see, earlier.longest, most=int(sides.max()))
+    if few is opened:
+        return found
+    return look_once(opened, replace(detect, image_size=found.looks[0].longest), cache=cache, boxes=boxes)
 
 
 def look_once(

@@ -12,6 +12,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.settle import settle
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
+from mvseg.masks import Masks
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Result
@@ -57,10 +58,8 @@ def shape_leaves(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | No
     """
     opened, config, num_moved = known.opened, known.opened.config, None
     if opened.is_chosen:
-        from mvseg.verification.snap_edges import snap_masks
-
         with timed("snap"):
-            known = known.with_masks(snap_masks(known.masks, opened.photos, cache=opened.snapped))
+            known = known.with_masks(complete_masks(known))
     if opened.is_checked:
         from mvseg.verification.checked_ids import check_ids
 
@@ -90,6 +89,16 @@ def shape_leaves(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | No
         fates=fates,
         learned=known.learned,
     )
+
+
+def complete_masks(known: Known) -> Masks:
+    """The masks that the views chose, with the parts of leaves that they lack, and their edges where colours change."""
+    from mvseg.verification.missing_parts import find_missing_parts
+    from mvseg.verification.snap_edges import snap_masks
+
+    masks, photos = known.masks.to("cpu"), known.opened.photos
+    missing = find_missing_parts(masks, known.instances.starts, photos, cameras=known.scene.cameras)
+    return snap_masks(masks, photos, missing=missing, cache=known.opened.snapped)
 
 
 def _fit_surfaces(known: Known, same_segmenter: Mapping[int, LeafSurface] | None) -> dict[int, LeafSurface]:

@@ -21,7 +21,7 @@ from mvseg.system.running import timed
 from mvseg.verification.choose import add_beside
 from mvseg.verification.evidence import Drawn, draw_views
 from mvseg.verification.leaf_color import colors_of_leaves
-from mvseg.verification.leaf_scores import expect_right
+from mvseg.verification.leaf_scores import rate_pass
 
 if TYPE_CHECKING:
     from mvseg.detection.find_leaves import Look
@@ -69,9 +69,9 @@ class Known:
         return self.matching.masks
 
     @property
-    def expected_right(self) -> float:
-        """E, see `expect_right`."""
-        return expect_right(self.masks, self.instances.probabilities)
+    def agreed_area(self) -> float:
+        """Pixels, see `rate_pass`."""
+        return rate_pass(self.masks, self.instances.probabilities)
 
     @cached_property
     def shown(self) -> Masks:

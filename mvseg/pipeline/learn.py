@@ -27,7 +27,8 @@ from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import know, look_once
+from mvseg.pipeline.find_in_photos import know, look_near
+from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole
@@ -38,10 +39,9 @@ from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
 from mvseg.verification.unexplained import is_familiar
 
 ROUNDS = 3  # where nobody says how many; most plants gain nothing from the third one (docs/detector.md)
-# Growth of E from which new weights stay. Scores rise with learning by themselves, and E with them: it grew by up to
-# 1.17 where masks became worse; where the detector finds a species for the first time, by 1.27 and more
-# (docs/detector.md).
-GROWTH = 1.2
+# Growth of the agreed area from which new weights stay. Where MV-PQ gained 0.04 or more, it grew by 1.13 to 1.23, and
+# by 1.08 where nothing was gained (docs/notes/detector.md).
+GROWTH = 1.1
 
 
 def learn(
@@ -50,28 +50,28 @@ def learn(
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
     A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
-    learn these (`fine_tune`); the detector looks again, at the same size; the views choose. The better one stays, by
-    E, the expected number of right masks. Rounds end when E grows by less than `GROWTH`. Ctrl-C ends them, too, and
-    what was there stays.
+    learn these (`fine_tune`); the detector looks again, at the same size and at those next to it (`look_near`); the
+    views choose. The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end
+    when it grows by less than `GROWTH`. Ctrl-C ends them, too, and what was there stays.
 
     Args:
         known: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of a person; his masks are certain.
         rounds: that a person asks for, who judges himself: so many are learned, and the last weights stay. None: as
-            many as `RunConfig.learn` says, and E judges.
+            many as `RunConfig.learn` says, and the agreed area judges.
 
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
-    best, expected = known, [known.expected_right]
+    best, areas = known, [known.agreed_area]
     try:
         for number in range(1, (_count_rounds(known) if rounds is None else rounds) + 1):
             with collect_warnings():  # what there is to say of edits, is said when they are applied
                 edited = apply_edits(best, corrections)
             chances = edited.instances.probabilities
             photos = known.opened.photos
-            labels = label_views(edited.masks, best.proposals, photos, probabilities=chances)
+            labels = label_views(complete_masks(edited), best.proposals, photos, probabilities=chances)
             if not labels.are_enough:
                 few = f"the views agree about {labels.num_leaves} leaves, and it takes {LEAST_LEAVES} to learn from"
                 warn(f"the detector has not learned this plant: {few}; outline some (mvseg correct), or give masks")
@@ -80,30 +80,43 @@ def learn(
                 how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
                 report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
-            seen = _learn_once(known, labels, cache)
-            expected.append(seen.expected_right)
-            if rounds is None and seen.expected_right < GROWTH * best.expected_right:
+            seen = _learn_once(best, labels, cache)
+            areas.append(seen.agreed_area)
+            if rounds is None and seen.agreed_area < GROWTH * best.agreed_area:
                 break
             best = replace(seen, learned=replace(seen.learned, rounds=number))
     except KeyboardInterrupt:
-        warn(f"learning was interrupted after {len(expected) - 1} rounds: what was found until then stays")
+        warn(f"learning was interrupted after {len(areas) - 1} rounds: what was found until then stays")
     except InputError as error:
         warn(f"the detector has not learned this plant: {error}")
-    return replace(best, learned=replace(best.learned, expected_right=tuple(expected)))
+    return replace(best, learned=replace(best.learned, agreed_area=tuple(areas)))
 
 
 def _count_rounds(known: Known) -> int:
-    """How many rounds to try; with "auto", none where the detector knows the species."""
+    """How many rounds to try; with "auto", none where the detector knows the species: it is sure of most leaves, and
+    sees them best at its own size."""
     opened = known.opened
     if not opened.is_chosen or opened.config.learn == "off":
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    return 0 if is_familiar(known.masks, sure_score=DETECTION.sure_score) else ROUNDS
+    is_known = is_familiar(known.masks, sure_score=DETECTION.sure_score) and not _is_smaller(known)
+    return 0 if is_known else ROUNDS
+
+
+def _is_smaller(known: Known) -> bool:
+    """Whether the views chose a smaller size than the one that the detector begins with, see `choose_size`."""
+    detect, look = known.opened.config.detect, known.looks[0]
+    _, description = read_weights(weights_path(detect.weights))
+    if detect.image_size is not None or description is None:
+        return False
+    sizes = known.scene.cameras.sizes if look.boxes is None else look.boxes[:, 2:] - look.boxes[:, :2]
+    own = min(description.image_size, int(sizes.max()))
+    return look.longest < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
 
 
 def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Known:
-    """The scene, seen with weights that have learned these labels."""
+    """The scene, seen with the weights that the run began with once they have learned these labels."""
     opened, look = known.opened, known.looks[0]
     boxes = look.boxes
     if boxes is None:
@@ -116,10 +129,17 @@ def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Kn
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
-    found = look_once(opened, detect, cache=cache, boxes=look.boxes)
+    found = look_near(opened, detect, cache=cache, earlier=look)
     with collect_warnings():
         seen = know(opened, found)
-    return replace(seen, learned=Learned(weights=path.read_bytes()))
+    return replace(seen, learned=Learned(weights=_at_size(path, found.looks[0].longest)))
+
+
+def _at_size(path: Path, size: int) -> bytes:
+    """The content of a file of learned weights, with the size at which the detector looks best with them."""
+    weights, description = read_weights(path)
+    assert description is not None, "expected weights with a description, as `_fine_tune` writes them"
+    return encode_weights(weights, replace(description, image_size=size))
 
 
 def _fine_tune(detect: DetectConfig, known: Known, labels: ViewLabels, boxes: Tensor) -> bytes:

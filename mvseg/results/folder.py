@@ -107,8 +107,8 @@ def describe_result(result: Result) -> dict[str, Any]:
     }
     if (traits := result.traits) is not None:
         said["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
-    if (learned := result.learned).expected_right:
-        said["learned"] = {"rounds": learned.rounds, "expected_right": learned.expected_right}
+    if (learned := result.learned).agreed_area:
+        said["learned"] = {"rounds": learned.rounds, "agreed_area": learned.agreed_area}
     if result.corrections is not None and result.corrections.edits:
         said["edits"] = dump_edits(result.corrections.edits)
     if result.fates:

@@ -105,7 +105,7 @@ def load_learned(folder: Path, run: RunRecord) -> Learned:
     """What the detector has learned from the scene of a result."""
     path = folder / DETECTOR_FILE
     weights = path.read_bytes() if path.is_file() else None
-    return Learned(weights=weights, rounds=run.learned.rounds, expected_right=run.learned.expected_right)
+    return Learned(weights=weights, rounds=run.learned.rounds, agreed_area=run.learned.agreed_area)
 
 
 def find_result(folder: Path) -> Path:

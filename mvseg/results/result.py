@@ -80,13 +80,13 @@ class Learned:
         weights: content of the file of the weights that found the leaves, if they were learned here; None: they were
             not.
         rounds: that they took.
-        expected_right: E, the number of masks that are expected to be right, before learning and after each round that
-            was tried; () where masks were given.
+        agreed_area: pixels, before learning and after each round that was tried, see `rate_pass`; () where masks were
+            given.
     """
 
     weights: bytes | None = None
     rounds: int = 0
-    expected_right: tuple[float, ...] = ()
+    agreed_area: tuple[float, ...] = ()
 
 
 NOTHING_LEARNED = Learned()

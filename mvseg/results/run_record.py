@@ -40,7 +40,7 @@ class LearnedRecord(_Part):
     """See `Learned`."""
 
     rounds: int = 0
-    expected_right: tuple[float, ...] = ()
+    agreed_area: tuple[float, ...] = ()
 
 
 class RunRecord(_Part):

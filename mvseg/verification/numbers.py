@@ -89,6 +89,7 @@ class SnapNumbers:
     band: float = 0.05  # way that an edge may move, in roots of its mask's area
     around: int = 3  # bands around a mask in which the photo tells what the background looks like
     most_px: int = 100  # limit: root of the area of a mask, larger ones are scaled; with all pixels it is as good
+    lacks: float = 0.05  # fraction of a leaf that its masks lack in most views, from which they are completed
     least_pixels: int = 10  # pixels surely of leaf, or of background, where an edge moves: GrabCut needs five of each
 
 

@@ -2,13 +2,15 @@
 
 A mask head answers on a small grid, and surfaces are smooth: both draw outlines that lie beside the leaf's. So within
 a narrow band along a mask's outline the photo decides, by GrabCut (Rother, Kolmogorov, Blake 2004), as OpenCV has it:
-what lies deeper inside stays leaf, what lies farther outside stays background. Not in the paper.
+what lies deeper inside stays leaf, what lies farther outside stays background. Where other views show that a mask lacks
+a part of its leaf (`missing_parts.py`), the photo decides about that part, too. Not in the paper.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -26,7 +28,13 @@ Pixels = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 
-def snap_masks(masks: Masks, photos: ReadPhoto, *, cache: dict[str, Bools] | None = None) -> Masks:
+def snap_masks(
+    masks: Masks,
+    photos: ReadPhoto,
+    *,
+    missing: Sequence[Crop | None] = (),
+    cache: dict[str, Bools] | None = None,
+) -> Masks:
     """Move the edges of the masks that a detector found to those of colour, see `snap`.
 
     None grows into another mask of its view, nor do two grow into the same pixel: the first row has it.
@@ -34,6 +42,7 @@ def snap_masks(masks: Masks, photos: ReadPhoto, *, cache: dict[str, Bools] | Non
     Args:
         masks: D masks.
         photos: of the views.
+        missing: D, the part of its leaf that each mask lacks, see `find_missing_parts`; (): none lacks any.
         cache: {digest of the arguments of `snap`: what it returned}; earlier ones are taken from it, new ones added.
 
     Returns:
@@ -51,42 +60,49 @@ def snap_masks(masks: Masks, photos: ReadPhoto, *, cache: dict[str, Bools] | Non
             shown = crops[row].cut(taken)
             shown |= crops[row].pixels.numpy()
         for row in (row for row in rows if moves[row]):
-            room = math.ceil(SNAP.around * SNAP.band * math.sqrt(crops[row].area)) + 1
-            x1, y1 = (max(0, low - room) for low in crops[row].box[:2])
-            x2, y2 = (min(size, high + room) for size, high in zip(photo.shape[1::-1], crops[row].box[2:], strict=True))
-            around = crops[row].within((x1, y1, x2, y2))
-            mask, shown = around.pixels.numpy(), around.cut(taken)
-            asked = mask, around.cut(photo), shown & ~mask
+            part = missing[row] if missing else None
+            whole = crops[row] if part is None else crops[row].union(part)
+            room = math.ceil(SNAP.around * SNAP.band * math.sqrt(whole.area)) + 1
+            x1, y1 = (max(0, low - room) for low in whole.box[:2])
+            x2, y2 = (min(size, high + room) for size, high in zip(photo.shape[1::-1], whole.box[2:], strict=True))
+            around = whole.within((x1, y1, x2, y2))
+            mask, shown = crops[row].within(around.box).pixels.numpy(), around.cut(taken)
+            others = shown & ~mask
+            likely = mask if part is None else around.pixels.numpy() & ~others
+            asked = mask, around.cut(photo), others, likely
             digest = hashlib.sha256(b"".join(f"{each.shape}".encode() + each.tobytes() for each in asked)).hexdigest()
             if digest not in cache:
-                cache[digest] = snap(*asked[:2], others=asked[2])
+                cache[digest] = snap(mask, asked[1], others=others, likely=likely)
             snapped = cache[digest]
             shown |= snapped
             crops[row] = Crop.of(snapped, (x1, y1))
     return replace_crops(masks, crops)
 
 
-def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
+def snap(mask: Bools, photo: Pixels, *, others: Bools, likely: Bools | None = None) -> Bools:
     """The mask whose edge lies where colours change, within `SNAP.band` of where it was.
 
     Args:
         mask: (H, W) bool, with room for the background around it.
         photo: (H, W, 3) uint8 RGB.
         others: (H, W) bool, disjoint from the mask: what other masks show.
+        likely: (H, W) bool, the mask and the part of its leaf that it lacks, disjoint from `others`; None: the mask.
+            The edge lies within a band around this one, and none of the part is surely leaf.
 
     Returns:
         (H, W) bool. The mask as it is, where too little of it lies deep inside, or nothing is around it.
     """
     height, width = mask.shape
-    scale = min(1.0, SNAP.most_px / max(math.sqrt(mask.sum()), 1.0))
+    whole = mask if likely is None else likely
+    scale = min(1.0, SNAP.most_px / max(math.sqrt(whole.sum()), 1.0))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     seen = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-    inside, beside = (
-        cv2.resize(each.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for each in (mask, others)
+    found, inside, beside = (
+        cv2.resize(each.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for each in (mask, whole, others)
     )
     radius = max(1, round(SNAP.band * math.sqrt(inside.sum())))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    deep = cv2.erode(inside.astype(np.uint8), disk, borderValue=1) > 0
+    deep = found & (cv2.erode(inside.astype(np.uint8), disk, borderValue=1) > 0)
     far = (cv2.dilate(inside.astype(np.uint8), disk) == 0) | (beside & ~inside)
     if min(deep.sum(), far.sum()) < SNAP.least_pixels:
         return mask

@@ -1,4 +1,4 @@
-"""The size at which most masks are expected to be right."""
+"""The size at which the agreed area is largest."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ from blade_scene import as_regions
 from found_masks import FoundMasks, open_photos
 from mvseg import demo_scene, load_scene
 from mvseg.config import RunConfig
-from mvseg.detection.choose_size import choose_size
+from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.find_leaves import find_leaves
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
-from mvseg.verification.leaf_scores import expect_right
+from mvseg.verification.leaf_scores import rate_pass
 
 
 def squares(views: int, *, side: int = 20, score: float = 0.9) -> Masks:
@@ -38,19 +39,19 @@ def look_of(masks: Masks, longest: int = 32) -> Any:
 
 
 def expecting(right: float, longest: int = 800) -> Any:
-    return SimpleNamespace(expected_right=right, looks=(SimpleNamespace(longest=longest),))
+    return SimpleNamespace(agreed_area=right, looks=(SimpleNamespace(longest=longest),))
 
 
 @pytest.mark.parametrize(
     ("expected", "asked", "best"),
     [
-        ({}, [566], 0),  # fewer at the first step
-        ({566: 130.0}, [566], 0),  # as many: the larger size stays
+        ({}, [566], 0),  # less at the first step
+        ({566: 130.0}, [566], 0),  # as much: the larger size stays
         ({566: 208.0, 400: 228.0, 283: 191.0, 200: 500.0}, [566, 400, 283], 400),  # as on a real croton
         ({566: 131, 400: 132, 283: 133, 200: 134, 141: 135, 100: 136, 71: 137, 50: 138, 35: 139}, None, 35),
     ],
 )
-def test_the_size_goes_down_as_long_as_more_is_expected(
+def test_the_size_goes_down_as_long_as_the_agreed_area_grows(
     expected: dict[int, float], asked: list[int] | None, best: int
 ) -> None:
     looks: list[int] = []
@@ -64,11 +65,41 @@ def test_the_size_goes_down_as_long_as_more_is_expected(
     assert looks == (asked or [*expected])
 
 
-def test_the_expected_number_of_right_masks() -> None:
-    masks = Masks.concatenate((squares(4, score=0.5), squares(4, score=0.25)))
-    assert expect_right(masks, {1: 0.8, 2: 0.4}) == pytest.approx(0.8 * 2 + 0.4 * 1)
-    assert expect_right(masks, {}) == 0
-    assert expect_right(masks.select(torch.arange(0)), {1: 1.0}) == 0
+@pytest.mark.parametrize(
+    ("areas", "most", "asked", "best"),
+    [
+        ({283: 200.0, 400: 227.0, 200: 180.0}, 1100, [283, 400, 200], 400),  # as of a muskmelon that was learned
+        ({283: 200.0, 400: 200.0, 200: 200.0}, 1100, [283, 400, 200], 283),
+        ({283: 200.0, 300: 210.0, 200: 220.0}, 300, [283, 300, 200], 200),
+        ({40: 10.0}, 40, [40], 40),  # the photos are no larger, and 28 pixels are too few
+    ],
+)
+def test_the_sizes_next_to_the_one_that_was_learned(
+    areas: dict[int, float], most: int, asked: list[int], best: int
+) -> None:
+    looks: list[int] = []
+
+    def see(size: int) -> Any:
+        looks.append(size)
+        return expecting(areas[size], size)
+
+    assert choose_near(see, asked[0], most=most).looks[0].longest == best
+    assert looks == asked
+
+
+def test_the_agreed_area_of_whole_leaves_is_larger_than_that_of_halves() -> None:
+    labels = np.zeros((60, 60), np.int64)
+    labels[:40, :20] = 1
+    halves = np.where(labels, 1 + (np.arange(60)[:, None] >= 20), 0)
+    q = torch.full((4,), 0.5)
+    whole = Masks.of(as_regions([labels] * 4)[0], torch.ones(4, dtype=torch.int64), q)
+    assert rate_pass(whole, {1: 0.8}) == pytest.approx(0.4 * 4 * 800 * 0.4)
+    assert rate_pass(whole, {}) == rate_pass(whole.select(torch.arange(0)), {1: 1.0}) == 0
+    regions = as_regions([halves] * 4)[0]
+    sure = Masks.of(regions, regions.labels, torch.ones(8))
+    assert rate_pass(sure, {1: 1.0, 2: 1.0}) == rate_pass(whole, {1: 1.0}) * 4  # each has a mask in every photo
+    mixed = sure.select((sure.view_index < 2) == (sure.instance_ids == 1))  # in half of the photos
+    assert rate_pass(mixed, {1: 1.0, 2: 1.0}) == rate_pass(sure, {1: 1.0, 2: 1.0}) / 4
 
 
 def test_what_two_looks_propose_is_one_set() -> None:
@@ -95,3 +126,23 @@ def test_looks_that_are_thrown_away_are_not_spoken_of(monkeypatch: pytest.Monkey
         find_in_photos(open_photos(load_scene(demo_scene()), RunConfig(detect=DetectConfig(image_size=size))))
     assert asked == ([300] if size else [None, 45])
     assert not [each for each in caught if "at 45" in str(each.message)]
+
+
+@pytest.mark.parametrize("is_cropped", [False, True])
+def test_a_part_of_many_photos_chooses_the_size(monkeypatch: pytest.MonkeyPatch, is_cropped: bool) -> None:
+    """All of them are seen once, at the size that won, in boxes of their own."""
+    asked: list[tuple[int, int | None, int | None]] = []
+
+    def detect(photos: Any, config: DetectConfig, *, boxes: torch.Tensor | None, **_: object) -> Any:
+        sizes = photos.scene.cameras.sizes
+        asked.append((len(sizes), config.image_size, None if boxes is None else len(boxes)))
+        masks = squares(len(sizes), side={None: 20, 45: 40, 32: 10}[config.image_size])
+        frames = torch.cat((torch.zeros_like(sizes), sizes), 1)
+        return replace(look_of(masks, longest=config.image_size or 64), boxes=frames if is_cropped else None)
+
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.detect_scene", detect)
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.DETECTION", replace(DETECTION, judging_views=4))
+    known = find_in_photos(open_photos(load_scene(demo_scene())))
+    some, every = (4, 9) if is_cropped else (None, None)
+    assert asked == [(4, None, None), (4, 45, some), (4, 32, some), (9, 45, every)]
+    assert known.masks.regions.num_views == 9
