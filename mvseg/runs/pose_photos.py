@@ -92,6 +92,7 @@ def pose_photos(
     if now_running().progress:
         say(summarize_poses(out, structure, placement=placement, scene=scene))
         say(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
+        say(f"next: mvseg infer {out}")
     return scene
 
 
