@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import warnings
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -36,9 +35,10 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.camera_faults import FAULTS, faulty_cameras
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_detected, load_maps
-from mvseg.errors import InputWarning
+from mvseg.errors import collect_warnings
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import shown_instances
+from mvseg.findings.sentences import DISAGREEMENT
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.nview.match_nview import find_clusters
@@ -63,7 +63,7 @@ class Outcome:
         kind, fault: which.
         num_views: V.
         ari: over the regions that show a leaf.
-        is_warned: whether `match_regions` says that the views hardly agree.
+        is_warned: whether `match_regions` warns that the views disagree.
         scores: (N,) of the matched regions that show a leaf.
         is_right: (N,) bool.
         features: (N, 5), see `scene_features`; None where they were not asked for.
@@ -111,11 +111,10 @@ def judge(regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault
         ids, found = clusters_and_features(regions, cameras)
         scores, is_warned = np.zeros(len(ids)), False
     else:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", InputWarning)
+        with collect_warnings() as findings:
             matching = match_regions(regions, cameras)
         ids, scores = matching.instance_ids, matching.match_scores.numpy()
-        is_warned = any("hardly agree" in str(each.message) for each in caught)
+        is_warned = any(each.code in DISAGREEMENT for each in findings)
     shows = truth > 0
     counts = ((ids > 0) & shows).numpy()
     return Outcome(

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from mvseg._version import __version__ as __version__
     from mvseg.checks.check_scene import Check as Check
     from mvseg.checks.check_scene import check_scene as check_scene
-    from mvseg.checks.finding import Finding as Finding
     from mvseg.config import RunConfig as RunConfig
     from mvseg.corrections.file import Corrections as Corrections
     from mvseg.corrections.file import load_corrections as load_corrections
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from mvseg.errors import InputWarning as InputWarning
     from mvseg.evaluation.id_metrics import matching_metrics as matching_metrics
     from mvseg.evaluation.shape_distance import shape_distance as shape_distance
+    from mvseg.findings.finding import Finding as Finding
     from mvseg.formats.masks.arrays import regions_from_masks as regions_from_masks
     from mvseg.formats.masks.arrays import with_instance_ids as with_instance_ids
     from mvseg.formats.photos import load_photos as load_photos

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from functools import wraps
 from typing import Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
 
+from mvseg.findings.finding import Finding, keep_causes
+
 P = ParamSpec("P")
 T = TypeVar("T")
 # Classes that users mix up, with what makes one.
@@ -36,43 +38,50 @@ class InputError(ValueError):
 
 
 class InputWarning(UserWarning):
-    """The input is odd but usable; the message says what was done about it. Kept in a result's `run.json`."""
+    """The input is odd but usable: the warning of a finding, and its sentence. Kept in a result's `run.json`."""
+
+    @property
+    def finding(self) -> Finding:
+        """The finding, to be told by its code."""
+        finding: Finding = self.args[0]
+        return finding
 
 
-def warn(said: str | Warning) -> None:
+def warn(said: Finding | Warning) -> None:
     """Warn (InputWarning) as of the line outside of this package that led here; one that was caught is repeated."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mvseg."):
         frame, level = frame.f_back, level + 1
-    warnings.warn(said, InputWarning, stacklevel=level)
+    warnings.warn(InputWarning(said) if isinstance(said, Finding) else said, stacklevel=level)
 
 
 @contextmanager
-def collect_warnings() -> Iterator[list[str]]:
-    """The sentences of InputWarnings inside the block, each once, when it ends, also by an exception; they are not
+def collect_warnings() -> Iterator[list[Finding]]:
+    """The findings of InputWarnings inside the block, each once, when it ends, also by an exception; they are not
     given. Other warnings are."""
-    sentences: list[str] = []
+    findings: list[Finding] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         try:
-            yield sentences
+            yield findings
         finally:
-            ours = (str(each.message) for each in caught if issubclass(each.category, InputWarning))
-            sentences += dict.fromkeys(ours)
+            for each in caught:
+                if isinstance(each.message, InputWarning) and each.message.finding not in findings:
+                    findings.append(each.message.finding)
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
 
 
 @contextmanager
-def note_warnings() -> Iterator[list[str]]:
-    """As `collect_warnings`, and they are given when the block ends, also by an exception."""
-    sentences: list[str] = []
+def note_warnings() -> Iterator[list[Finding]]:
+    """As `collect_warnings`; those that no other one explains are given when the block ends, also by an exception."""
+    findings: list[Finding] = []
     try:
-        with collect_warnings() as sentences:
-            yield sentences
+        with collect_warnings() as findings:
+            yield findings
     finally:
-        for sentence in sentences:
-            warn(sentence)
+        for finding in keep_causes(findings):
+            warn(finding)
 
 
 def say_fault(error: OSError | MemoryError) -> str:

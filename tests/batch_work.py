@@ -7,14 +7,14 @@ import pickle
 import signal
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.system import worker_pool
 
 start_worker = worker_pool._start_worker
@@ -42,7 +42,7 @@ def square(number: int) -> tuple[int, int, str | None]:
     if number == 13:
         raise InputError("13 brings bad luck")
     if number == 7:
-        warnings.warn("7 is odd", InputWarning, stacklevel=1)
+        warn(Finding("dark_photo", "7"))
     if number < 0:
         os.kill(os.getpid(), signal.SIGKILL)
     return number**2, os.getpid(), os.environ.get("OMP_NUM_THREADS")

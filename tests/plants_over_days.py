@@ -22,7 +22,7 @@ from mvseg.scene import Cameras, Scene, View
 from mvseg.tracking.dates import Floats, Number, PlantOnDate, SeenLeaf, resample
 from mvseg.tracking.numbers import SIGHTS
 from mvseg.tracking.track import Tracks
-from mvseg.traits.filters import Rejection
+from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import LEAF_TRAITS
@@ -104,7 +104,7 @@ def write_result(
     unit: str = "mm",
     view: str = "000",
     shapeless: Collection[int] = (),
-    rejected: Mapping[int, str] = MappingProxyType({}),
+    rejected: Mapping[int, Kind] = MappingProxyType({}),
 ) -> None:
     """A result folder of one view, with leaves numbered as they are; some have no shape, some are rejected."""
     labels, surfaces, leaves = np.zeros((40, 20 * len(blades)), np.int64), {}, []
@@ -119,7 +119,7 @@ def write_result(
         numbers |= {name: Measurement(value, 0.02 * value, "surface") for name, value in measured.items()}
         leaves.append(LeafTraits(
             leaf=number, numbers=numbers, method="none" if number in shapeless else "surface",
-            reasons=(reason,) if reason else (), rejection=Rejection.of(rejected[number]) if reason else None,
+            reasons=(reason,) if reason else (), rejection=rejected.get(number),
         ))  # fmt: skip
     regions = regions_from_label_maps([labels])
     whole = {"total_leaf_area": Measurement(5000.0, 50.0, "surface")}

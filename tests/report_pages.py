@@ -13,8 +13,7 @@ from mvseg.results.result import Result
 HOSTILE = '"\'></script><script>document.title = "owned"</script><img src=x onerror=alert(1)><!-- &amp; ${x}'
 RUN = {
     "mvseg": "1.2.3",
-    "warnings": [f"warned {HOSTILE}"],
-    "checks": [{"where": "photos", "what": f"found {HOSTILE}", "level": "error", "views": [0]}],
+    "findings": [{"level": "error", "topic": "photos", "sentence": f"found {HOSTILE}"}],
     "config": {"masks": HOSTILE, "limit": float("inf")},
     "inputs": {HOSTILE: "0" * 64},
     "seconds": {"match": 1.5},

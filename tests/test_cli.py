@@ -26,7 +26,8 @@ from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
 from mvseg.detection.config import DetectConfig
-from mvseg.errors import InputWarning
+from mvseg.errors import InputWarning, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
@@ -230,7 +231,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
     assert run["mvseg"] == mvseg.__version__
     assert run["mask_kind"] == "label images"
     assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}
-    assert run["warnings"] == []
+    assert [each for each in run["findings"] if each["level"] != "note"] == []
 
 
 @pytest.mark.parametrize(
@@ -461,10 +462,12 @@ def test_two_cameras_that_share_a_centre(
         shutil.copy(plant / kind / "000.png", plant / kind / "001.png")
     coarse = COARSE if verb == "infer" else []
     assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *coarse]) == 0
-    warning = "views 0 and 1 share a camera centre: this pair is skipped"
-    assert capsys.readouterr().err == f"mvseg: warning: {warning}\n"
     (run,) = (tmp_path / "out").rglob("run.json")
-    assert json.loads(run.read_text())["warnings"] == [warning]
+    findings = json.loads(run.read_text())["findings"]
+    shared = next(each for each in findings if each["code"] == "same_position")
+    assert shared["views"] == [0, 1]
+    assert f"mvseg: warning: {shared['sentence']}\n" in capsys.readouterr().err
+    assert "centres_shared" not in [each["code"] for each in findings]
 
 
 @pytest.mark.parametrize("verb", ["infer", "match"])
@@ -473,7 +476,7 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
         write_image(path, np.zeros((HEIGHT, WIDTH), np.uint16))
     assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     captured = capsys.readouterr()
-    assert captured.err == "mvseg: warning: the masks of all views are empty: there are no instances\n"
+    assert captured.err == "mvseg: warning: the masks of all views are empty: there are no instances to match\n"
     assert captured.out.endswith(": 0 instances from 0 masks (label images) in 4 views\n")
     out = tmp_path / "out" if verb == "infer" else tmp_path / "out" / "plant"
     content = json.loads((out / "instances.json").read_text())
@@ -566,8 +569,8 @@ def test_bad_input(name: str, plant: Path, tmp_path: Path, capfd: pytest.Capture
     """What libraries write to stderr by themselves would show, too."""
     change, message = BAD_INPUT[name]
     change(plant)
-    masks = "masks.json" if (plant / "masks.json").exists() else "masks"
     before = sorted(tmp_path.rglob("*"))
+    masks = "masks.json" if "COCO" in name else "masks"
     assert main(["infer", str(plant), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet", *COARSE]) == 2
     assert message in complaint(capfd)
     assert sorted(tmp_path.rglob("*")) == before  # no result, and nothing half of one
@@ -692,6 +695,7 @@ def test_a_second_run_does_not_take_the_detections_of_the_first(
     kept, command = tmp_path / "out.detections", ["infer", "--quiet", "--out", str(tmp_path / "out"), *COARSE]
 
     def interrupt(*_: object, **__: object) -> None:
+        capsys.readouterr()
         assert main([*command, str(plant)]) == 2
         assert complaint(capsys) == f"{kept}: another run is writing to this folder, expected one at a time"
         raise KeyboardInterrupt
@@ -825,7 +829,8 @@ def test_detect_options_beside_masks_are_warned_of(
     arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet", *COARSE]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert "the detect options have no effect" in capsys.readouterr().err
-    assert "detect" in json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][0]
+    findings = json.loads((tmp_path / "out" / "run.json").read_text())["findings"]
+    assert "detect_options_unused" in [each["code"] for each in findings]
 
 
 def test_a_repeated_warning_is_given_once(
@@ -833,13 +838,14 @@ def test_a_repeated_warning_is_given_once(
 ) -> None:
     def warn_twice(*args: Any, **options: Any) -> Matching:
         for _ in range(2):
-            warnings.warn("look here", InputWarning, stacklevel=1)
+            warn(Finding("one_number", "look here"))
         return match_masks(*args, **options)
 
     monkeypatch.setattr("mvseg.pipeline.known.match_masks", warn_twice)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert capsys.readouterr().err == "mvseg: warning: look here\n"
-    assert json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["warnings"] == ["look here"]
+    assert capsys.readouterr().err.count("look here") == 1
+    findings = json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["findings"]
+    assert [each["where"] for each in findings].count("look here") == 1
 
 
 def test_match_without_masks_is_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -29,6 +29,7 @@ from mvseg.corrections.file import FORMAT, Corrections, Reject, load_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
@@ -46,7 +47,7 @@ from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
 from mvseg.server.local_server import CorrectionServer
-from mvseg.server.open_result import OpenResult, keep_numbers, open_alone
+from mvseg.server.open_result import OpenResult, as_sentence, keep_numbers, open_alone
 from mvseg.server.vanished import tell_vanished
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
@@ -253,16 +254,19 @@ def surfaces_by_masks(result: Result) -> dict[tuple[str, ...], bytes]:
 
 def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = OpenResult(folder)
-    opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"warnings": ("2 masks are cut off",)}))
+    cut_off, more = (Finding("shape_cut_off", values={"count": count}) for count in (2, 3))
+    opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"findings": (cut_off.as_json(),)}))
 
     def shape(known: Known, **_: object) -> Result:
-        warn("3 masks are cut off")
-        warn("photo 1 is dark")
-        warn("photo 2 is dark")
+        warn(more)
+        for photo in ("1", "2"):
+            warn(Finding("dark_photo", photo))
         return shape_leaves(known)
 
     monkeypatch.setattr("mvseg.server.open_result.shape_leaves", shape)
-    assert opened.recompute(Corrections(), lambda: False)[2] == ["Photo 1 is dark.", "Photo 2 is dark."]
+    assert opened.recompute(Corrections(), lambda: False)[2] == [
+        as_sentence(Finding("dark_photo", photo)) for photo in ("1", "2")
+    ]
 
 
 def test_it_opens_with_what_the_run_knew_before_edits(
@@ -282,7 +286,7 @@ def test_it_opens_with_what_the_run_knew_before_edits(
         patch.setattr(torch, "__version__", "0.0")
         assert len(OpenResult(place)._known[0].masks) == len(known.masks)
     opened = OpenResult(place)
-    opened._changes.append("masks: has changed since this result was made.")
+    opened._changes.append(Finding("input_changed", "masks"))
     assert len(opened._known[0].masks) == len(known.masks)
     (place / BEFORE_EDITS_FILE).write_bytes(b"another")
     assert len(OpenResult(place)._known[0].masks) == len(known.masks)
@@ -411,7 +415,7 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     earlier = run["config"] | {"corrections": "corrections.json"}  # a run with corrections can be corrected again
     (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0", "config": earlier}))
     notice = OpenResult(tmp_path).notice
-    assert notice.startswith("What you see is computed anew. mvseg 0.0 made this result")
+    assert notice.startswith("What you see is computed anew. This result was made by mvseg 0.0,")
     assert OpenResult(folder).opened.config.match == MatchConfig()
 
 
@@ -685,7 +689,7 @@ def test_inputs_that_changed_or_moved_since(
     capsys.readouterr()
     assert main(["infer", "--again", str(elsewhere / "out"), "--quiet"]) == 0  # in place
     said = capsys.readouterr()
-    assert f"{photos}: 1 of 4 photos have changed since this result was made (001.png)." in said.err
+    assert f"{photos}: 1 of 4 photos have changed since this result was made (001.png)" in said.err
     assert said.out.endswith("(in place of an earlier result)\n")
     assert OpenResult(elsewhere / "out").notice == ""
 
@@ -702,10 +706,11 @@ def test_a_strangers_result_makes_nobody_read_other_files(tmp_path: Path) -> Non
     run["photo_sha256"] |= {"../../private.txt": "0", "/dev/zero": "0"}
     (out / "run.json").write_text(json.dumps(run))
     changes = read_recorded(out).changes
-    assert f"{tmp_path / 'private.txt'}: is not looked at, since the run did not read it." in changes
-    assert "/: is not looked at, since the run did not read it." in changes
-    assert "/dev/zero: is gone since this result was made." in changes
-    assert any("2 of 6 photos are gone" in each for each in changes)
+    assert Finding("input_not_read", str(tmp_path / "private.txt")) in changes
+    assert Finding("input_not_read", "/") in changes
+    assert Finding("input_gone", "/dev/zero") in changes
+    (gone,) = [each for each in changes if each.code == "photos_gone"]
+    assert (gone.values["count"], gone.values["total"]) == (2, 6)
 
 
 def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:

@@ -22,7 +22,7 @@ from synthetic import arc_positions, cameras_at
 from tiny_training import build_tiny
 
 # what an untrained detector finds in noise does not agree across views
-pytestmark = pytest.mark.filterwarnings("ignore:the views hardly agree")
+pytestmark = pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 
 WIDTH, HEIGHT = 80, 60
 CAMERAS = cameras_at(arc_positions(3), focal=100.0, width=WIDTH, height=HEIGHT)

@@ -11,12 +11,13 @@ from typing import Any
 import pytest
 import torch
 
-from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
+from mvseg import Corrections, InputError, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
+from warned import warns_of
 
 IDS_ONLY = RunConfig(reconstruct=None)
 SHAPES = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
@@ -50,7 +51,7 @@ def rejects(*views: str) -> Corrections:
 
 
 def test_it_is_the_run_of_a_scene_without_the_other_views(plant: Path, tmp_path: Path) -> None:
-    with pytest.warns(InputWarning, match=r"masks: 15 of 27 masks are left out: 4 of 9 views are taken \(views is 4\)"):
+    with warns_of("masks_of_other_views"):
         some = run_scene(plant, plant / "masks", replace(COARSE, views=4))
     names = [view.name for view in some.scene.views]
     assert names == taken(plant, 4) != ["000", "001", "002", "003"]
@@ -86,11 +87,11 @@ def test_views_that_corrections_name_are_taken_besides(plant: Path) -> None:
     absent, other, *_ = (f"{view:03d}" for view in range(9) if f"{view:03d}" not in few)
     assert taken(plant, 4, corrections=rejects(few[1])) == few
     assert taken(plant, 4, corrections=rejects(absent, f"{other}.png", "nowhere")) == sorted([*few, absent, other])
-    with pytest.warns(InputWarning) as caught:  # not of the views: the edits find their photos
+    with warns_of("masks_of_other_views", "edit") as noticed:  # not of the views: the edits find their photos
         run_scene(plant, plant / "masks", replace(IDS_ONLY, views=4), corrections=rejects(absent))
-    said = [str(each.message) for each in caught]
-    assert "12 of 27 masks are left out: 5 of 9 views are taken" in said[0]
-    assert f"there is no mask at (1, 1) in view {absent}" in said[1]
+    of_code = {each.code: each for each in noticed}
+    assert [of_code["masks_of_other_views"].values[name] for name in ("count", "total", "taken")] == [12, 27, 5]
+    assert f"there is no mask at (1, 1) in view {absent}" in str(of_code["edit"])
 
 
 def test_a_result_says_which_views_it_shows_and_is_made_again_with_them(
@@ -121,12 +122,12 @@ def test_a_result_is_corrected_in_its_own_views_and_in_those_that_were_corrected
     words = ["--masks", "masks", "--views", "4", "--out", str(out), "--quiet", "--report", "false", *SHAPES]
     assert main(["infer", str(plant), *words]) == 0
     few = taken(plant, 4)
-    with pytest.warns(InputWarning, match="15 of 27 masks are left out"):
+    with warns_of("masks_of_other_views"):
         assert [view.name for view in OpenResult(out).scene.views] == few
     other = next(f"{view:03d}" for view in range(9) if f"{view:03d}" not in few)
     edits = [{"op": "reject", "view": other, "at": [1, 1]}]
     (out / CORRECTIONS_FILE).write_text(json.dumps({"format": FORMAT, "edits": edits}))
-    with pytest.warns(InputWarning, match="12 of 27 masks are left out"):
+    with warns_of("masks_of_other_views"):
         assert [view.name for view in OpenResult(out).scene.views] == sorted([*few, other])
 
 

@@ -46,7 +46,7 @@ def ids_with_and_without(cameras: Cameras, regions: Regions) -> tuple[Tensor, Te
 
 @pytest.mark.slow
 @pytest.mark.shared_data
-@pytest.mark.filterwarnings("ignore:the views hardly agree")
+@pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 @pytest.mark.parametrize("name", LEAST_ARI)
 def test_surfaces_never_harm_ids_of_real_plants(name: str, shared_data: Path) -> None:
     cameras, regions, truth = read(shared_data / name)
@@ -54,7 +54,7 @@ def test_surfaces_never_harm_ids_of_real_plants(name: str, shared_data: Path) ->
     assert found >= max(alone, LEAST_ARI[name])
 
 
-@pytest.mark.filterwarnings("ignore:the views hardly agree")
+@pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 @pytest.mark.parametrize(
     ("family", "seed"), [("rosette", 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHERS)]
 )

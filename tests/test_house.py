@@ -34,7 +34,8 @@ PACKAGE = ROOT / "mvseg"
 # A room (a folder, or a module of the top level) imports only from the lines above its own, so rooms of one line never
 # import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
 FLOORS = (
-    ("errors", "_version"),
+    ("findings", "_version"),
+    ("errors",),
     ("system",),
     ("scene", "crop"),
     ("regions",),
@@ -117,7 +118,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 41_850, "benchmarks": 6_650, "tests": 36_050}
+BUDGET = {"mvseg": 41_850, "benchmarks": 6_650, "tests": 36_200}
 SLACK = 400
 
 

@@ -18,7 +18,7 @@ from mvseg.demo import demo_scene
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.zoo import weights_path
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import learn as module
@@ -30,6 +30,7 @@ from mvseg.pipeline.open_scene import open_scene
 from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
 from mvseg.training.view_labels import ViewLabels
+from warned import warns_of
 
 SIZE = 96
 
@@ -146,12 +147,8 @@ def test_what_was_there_stays_and_one_sentence_says_why(
 
     known = see(leafy, monkeypatch, leaves=2 if reason == "few" else 4, learn=2)
     monkeypatch.setattr(module, "_learn_once", stop)
-    said = {
-        "few": "the views agree about 2 leaves, and it takes 3",
-        "interrupt": "interrupted after 0 rounds",
-        "fails": "has not learned this plant: it tells several kinds apart",
-    }
-    with pytest.warns(InputWarning, match=said[reason]):
+    codes = {"few": "learned_too_few", "interrupt": "learning_interrupted", "fails": "learning_failed"}
+    with warns_of(codes[reason]):
         seen = learn(known, cache=CachedDetections(tmp_path))
     assert seen.agreed_area == known.agreed_area
     assert seen.learned.weights is None

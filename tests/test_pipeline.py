@@ -18,7 +18,6 @@ import mvseg
 from found_masks import FoundMasks, see_masks
 from mvseg import (
     InputError,
-    InputWarning,
     MatchConfig,
     ReconstructConfig,
     RunConfig,
@@ -34,6 +33,7 @@ from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detectors.zoo import weights_path
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import read_masks
@@ -53,6 +53,7 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
+from warned import warns_of
 
 IDS_ONLY = RunConfig(reconstruct=None)
 COARSE = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_budget=500))
@@ -136,7 +137,7 @@ def test_the_users_word_on_the_world(plant: Path) -> None:
 
 
 def test_another_unit_without_a_scale_is_warned_of(plant: Path) -> None:
-    with pytest.warns(InputWarning, match="the cameras are in mm: unit cm without a scale only renames it"):
+    with warns_of("unit_only_renamed"):
         assert run_scene(plant, plant / "masks", replace(IDS_ONLY, unit="cm")).scene.unit == "cm"
 
 
@@ -155,7 +156,7 @@ def test_a_scale_without_a_unit_is_refused_where_the_cameras_say_theirs(plant: P
 
 def test_an_up_that_the_cameras_contradict_is_warned_of(plant: Path) -> None:
     run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, -1.0, 0.0)))  # +y is down there
-    with pytest.warns(InputWarning, match="up may be upside down: the cameras look up at the plant"):
+    with warns_of("upside_down"):
         run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, 1.0, 0.0)))
 
 
@@ -188,10 +189,10 @@ class TestDescribeRun:
     def test_it_says_where_a_result_comes_from(self, plant: Path) -> None:
         result = run_scene(plant, plant / "masks", IDS_ONLY)
         config = RunConfig(match=MatchConfig(seed=3), reconstruct=None)
-        run = describe_run(result, plant / "masks", config, messages=["odd"])
+        run = describe_run(replace(result, findings=(Finding("no_masks"),)), plant / "masks", config)
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
-        assert run["warnings"] == ["odd"]
+        assert [each["code"] for each in run["findings"]] == ["no_masks"]
         ran = {"views", "match", "split_merged", "coco_crowd", "categories", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
@@ -391,9 +392,9 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
 
 def test_warnings_before_an_error_are_given(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(_: object) -> None:
-        warn("view 3 is dark")
+        warn(Finding("dark_photo", "view 3"))
         raise InputError("view 4 is missing")
 
     monkeypatch.setattr("mvseg.pipeline.run_scene.match_given", fail)
-    with pytest.warns(InputWarning, match="view 3 is dark"), pytest.raises(InputError, match="view 4 is missing"):
+    with warns_of("dark_photo"), pytest.raises(InputError, match="view 4 is missing"):
         run_scene(plant, plant / "masks", IDS_ONLY)

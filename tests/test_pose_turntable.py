@@ -87,7 +87,7 @@ def test_an_unsure_focal_length_is_warned_of_and_a_given_one_is_sure(
     assert re.search(r"camera: focal length 69\d \+- \d.* px \(1.\d%\): .* as uncertain; photograph the board", said)
     written = json.loads((tmp_path / "table" / "pose.json").read_text())
     assert 7 < written["lenses"][0]["focal_length"]["deviation"] < 14
-    assert written["warnings"] == [said.removeprefix("mvseg: warning: ").rstrip()]
+    assert [each["code"] for each in written["findings"]] == ["turntable_focal_length_unsure"]
 
     lens = tmp_path / "lens.yaml"
     matrix = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's first pixel has its centre at (0, 0)

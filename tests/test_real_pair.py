@@ -18,7 +18,6 @@ from skimage.data import stereo_motorcycle
 from torch import Tensor
 
 from mvseg import (
-    InputWarning,
     MatchConfig,
     Regions,
     Scene,
@@ -29,6 +28,7 @@ from mvseg import (
     matching_metrics,
 )
 from scene_folders import write_image
+from warned import warns_of
 
 FOLDER = Path(__file__).parent / "motorcycle"
 
@@ -45,7 +45,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture(scope="module")
 def regions(scene: Scene) -> Regions:
-    with pytest.warns(InputWarning, match="masks of 18 categories are taken alike"):
+    with warns_of("several_categories"):
         return load_masks(scene, FOLDER / "masks.json")
 
 

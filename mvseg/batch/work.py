@@ -94,7 +94,7 @@ def _finish(request: RunRequest, *, cache: Path) -> Status:
         instances=solved.result.matching.num_instances,
         masks=len(solved.result.regions),
         views=len(solved.result.scene.views),
-        warnings=solved.messages,
+        warnings=[str(each) for each in solved.result.findings if each.level != "note"],
     )
 
 

@@ -9,11 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.checks.numbers import CAMERAS
-from mvseg.formats.find_views import name_views
+from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
+from mvseg.verification.numbers import ROUGH
 
 Floats = NDArray[np.float64]
 
@@ -65,99 +65,70 @@ def find_coverage(cameras: Cameras) -> Coverage:
 
 def camera_findings(scene: Scene, coverage: Coverage) -> list[Finding]:
     """The findings about the cameras of a scene."""
-    names = tuple(view.name for view in scene.views)
-    return [
-        *_place_findings(scene.cameras, coverage, names),
-        *_lens_findings(scene.cameras, names),
-        *_world_findings(scene),
-    ]
+    cameras, names = scene.cameras, tuple(view.name for view in scene.views)
+    rules = [*_place_rules(cameras, coverage), *_lens_rules(cameras), *_world_rules(scene)]
+    return list_findings(rules, names)
 
 
-def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
+def _place_rules(cameras: Cameras, coverage: Coverage) -> list[Rule]:
     if bool(is_coincident(cameras).all()):
-        what = "all cameras are at one place, where depth cannot be seen: do R and t map world points to the camera?"
-        return [Finding(where="cameras", what=what, level="error")]
-    if (mixed := _mixed_units(cameras, coverage, names)) is not None:
-        return [mixed]
-    if reading := _other_reading(cameras, coverage):
-        return [Finding(where="cameras", what=reading, level="error")]
-    share = coverage.sees.mean()
-    findings: list[Finding] = []
-    unseeing = tuple(np.flatnonzero(~coverage.sees).tolist())
-    if coverage.sees.sum() < 2:
-        what = "no two cameras look at one point: do R and t map world points to the camera?"
-        findings.append(Finding(where="cameras", what=what, level="error"))
-    elif unseeing and share > 0.5:
-        point = f"the point that the other {coverage.sees.sum()} look at"
-        rule: Rule = ("warning", unseeing, f"{{}} look past {point}: check the pose, or leave the photo out")
-        findings += list_findings("cameras", [rule], names)
+        return [("same_place", "error", None, {})]
+    if wrong := _mixed_units(cameras, coverage) or _other_reading(cameras, coverage):
+        return [wrong]
+    num, total = int(coverage.sees.sum()), len(cameras)
+    unseeing = np.flatnonzero(~coverage.sees).tolist()
+    rules: list[Rule] = []
+    if num < 2:
+        rules.append(("no_common_point", "error", None, {}))
+    elif num > total / 2:
+        rules.append(("look_past", "warning", unseeing, {"others": num}))
     elif unseeing:
-        what = f"no point is seen by more than {coverage.sees.sum()} of {len(names)} cameras: check the poses, unless "
-        findings.append(Finding(where="cameras", what=f"{what}the photos show different plants", level="warning"))
-    findings += _baseline_findings(cameras, coverage, names)
+        rules.append(("few_look_at_one_point", "warning", None, {"num": num, "total": total}))
+    rules += _baseline_rules(cameras, coverage)
     centers = cameras.centers.numpy()
     distance = np.linalg.norm(centers - np.median(centers, 0), axis=1)
     usual = float(np.median(distance))
-    far = tuple(np.flatnonzero(distance > CAMERAS.far * usual).tolist()) if len(names) > 3 and usual > 0 else ()
-    what = (
-        f"{{}}: {distance.max() / max(usual, 1e-300):.0f} times as far out as the other cameras; is t in another unit?"
-    )
-    return findings + list_findings("cameras", [("warning", far, what)], names)
+    far = np.flatnonzero(distance > CAMERAS.far * usual).tolist() if total > 3 and usual > 0 else []
+    ratio = float(distance.max()) / max(usual, 1e-300)
+    return [*rules, ("far_out", "warning", far, {"ratio": ratio})]
 
 
-def _baseline_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
+def _baseline_rules(cameras: Cameras, coverage: Coverage) -> list[Rule]:
     twins = torch.triu(is_coincident(cameras), diagonal=1).nonzero().flatten().unique().tolist()
-    what = "{} have the same position as other cameras, which gives no depth: move the camera"
-    findings = list_findings("cameras", [("warning", twins, what)], names)
-    spread = _widest_angle(cameras, coverage)
-    if coverage.sees.sum() > 1 and spread < CAMERAS.narrow:
-        what = f"the views differ by {spread:.1f} degrees at most: depth is uncertain; photograph from more sides"
-        findings.append(Finding(where="cameras", what=what, level="warning"))
+    rules: list[Rule] = [("same_position", "warning", twins, {})]
+    walked = _widest_angle(cameras, coverage)
+    if coverage.sees.sum() > 1 and walked < ROUGH.least_parallax:
+        rules.append(("no_depth" if walked < CAMERAS.narrow else "one_sided", "warning", None, {"degrees": walked}))
     angle = np.nan_to_num(coverage.angle)
-    facts = f"the next view is {angle.max():.0f} degrees away and shows few of the same leaves"
-    lonely: Rule = ("warning", np.flatnonzero(angle > CAMERAS.wide).tolist(), f"{{}}: {facts}; add photos between")
-    return findings + list_findings("cameras", [lonely], names)
+    lonely = np.flatnonzero(angle > CAMERAS.wide).tolist()
+    return [*rules, ("next_view_far", "warning", lonely, {"degrees": float(angle.max())})]
 
 
-def _lens_findings(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+def _lens_rules(cameras: Cameras) -> list[Rule]:
     K, sizes = cameras.K.numpy(), cameras.sizes.numpy().astype(float)
     focal, center = K[:, [0, 1], [0, 1]], K[:, :2, 2]
-    view_deg, (least, most) = field_of_view(cameras), CAMERAS.field_of_view
+    degrees, (least, most) = field_of_view(cameras), CAMERAS.field_of_view
+    beside = np.abs(center / sizes - 0.5).max(1)
+    ratio = focal.max(1) / focal.min(1)
     found = (
-        (
-            (view_deg < least) | (view_deg > most),
-            f"a field of view of {{:.0f}} degrees, expected {least:.0f} to {most:.0f}: is K in "
-            "pixels, of photos of this size?",
-            view_deg,
-        ),
-        (
-            (np.abs(center / sizes - 0.5) > CAMERAS.off_center).any(1),
-            "a principal point {:.0%} of the photo's size beside its middle: is K that of photos of another size, or "
-            "before they were cropped?",
-            np.abs(center / sizes - 0.5).max(1),
-        ),
-        (
-            focal.max(1) > CAMERAS.square * focal.min(1),
-            "focal lengths of x and y that differ by a factor of {:.2f}: was the photo scaled in one direction only?",
-            focal.max(1) / focal.min(1),
-        ),
+        ("odd_field_of_view", (degrees < least) | (degrees > most), "degrees", degrees),
+        ("odd_principal_point", beside > CAMERAS.off_center, "share", beside),
+        ("odd_focal_lengths", focal.max(1) > CAMERAS.square * focal.min(1), "ratio", ratio),
     )
-    rules: list[Rule] = [
-        ("warning", np.flatnonzero(is_odd).tolist(), "{} have " + what.format(value[is_odd].max(initial=0)))
-        for is_odd, what, value in found
-    ]
-    return list_findings("cameras", rules, names)
+    return [
+        (code, "warning", np.flatnonzero(is_odd).tolist(),
+         {name: float(value[is_odd].max(initial=0)), "least": least, "most": most})
+        for code, is_odd, name, value in found
+    ]  # fmt: skip
 
 
-def _world_findings(scene: Scene) -> list[Finding]:
-    notes = []
-    if not scene.unit:
-        notes.append("the cameras do not say their unit: lengths are in world units, unless --scale and --unit say it")
+def _world_rules(scene: Scene) -> list[Rule]:
+    rules: list[Rule] = [] if scene.unit else [("unknown_unit", "note", None, {})]
     if scene.up is None:
-        notes.append("the cameras do not say which way is up: heights and angles are not measured, unless --up says it")
+        rules.append(("unknown_up", "note", None, {}))
     elif scene.seems_upside_down:
-        notes.append("up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it")
-    return [Finding(where="cameras", what=what, level="note") for what in notes]
+        rules.append(("upside_down", "warning", None, {}))
+    return rules
 
 
 def field_of_view(cameras: Cameras) -> Floats:
@@ -166,10 +137,10 @@ def field_of_view(cameras: Cameras) -> Floats:
     return np.asarray(torch.rad2deg(2 * half.norm(dim=1).atan()).numpy())
 
 
-def _mixed_units(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> Finding | None:
-    """Is t in one unit in some views, and in another one in the rest?
+def _mixed_units(cameras: Cameras, coverage: Coverage) -> Rule | None:
+    """The rule about views whose t is in another unit than in the rest; None where there are none.
 
-    Then there are two lengths of t, and with a factor between units all cameras look at one point from like distances.
+    There are two lengths of t then, and with a factor between units all cameras look at one point from like distances.
     Cameras that do so as they are have one unit, wherever the world's origin is.
     """
     lengths = torch.linalg.vector_norm(cameras.t, dim=1)
@@ -186,13 +157,11 @@ def _mixed_units(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -
             found = find_coverage(scaled)
             if found.sees.mean() < CAMERAS.all or _distance_ratio(scaled, found, is_short) > CAMERAS.alike:
                 continue
-            few, length = (is_short, "short") if 2 * place <= len(cameras) else (~is_short, "long")
-            views = tuple(few.nonzero()[:, 0].tolist())
-            facts = f"t is some {factor} times as {length} as in the other {len(cameras) - len(views)}"
-            step = f"is t in another unit ({units})? In one, {found.sees.sum()} of {len(cameras)} look at one point"
-            what = f"{name_views(views, names)}: {facts}; {step}"
+            few, ratio = (is_short, 1 / factor) if 2 * place <= len(cameras) else (~is_short, float(factor))
+            views, num = few.nonzero()[:, 0].tolist(), int(found.sees.sum())
             is_sure = factor > min(UNITS) or share < CAMERAS.all
-            return Finding(where="cameras", what=what, level="error" if is_sure else "warning", views=views)
+            counts: Values = {"others": len(cameras) - len(views), "num": num, "total": len(cameras)}
+            return "mixed_units", "error" if is_sure else "warning", views, {**counts, "ratio": ratio, "units": units}
     return None
 
 
@@ -203,41 +172,30 @@ def _distance_ratio(cameras: Cameras, coverage: Coverage, is_short: Tensor) -> f
     return max(short / long, long / short)
 
 
-def _other_reading(cameras: Cameras, coverage: Coverage) -> str | None:
-    """What R and t seem to be instead, as a sentence; None if they seem right.
+def _other_reading(cameras: Cameras, coverage: Coverage) -> Rule | None:
+    """The rule about what R and t seem to be instead; None if they seem right.
 
     Inverted poses may still look at one point: cameras around a plant then stand close together and look in one
     direction, each rotated about its own axis.
     """
     R, t, flip = cameras.R, cameras.t, torch.from_numpy(FLIP)
-    inverse = replace(cameras, R=R.mT, t=cameras.centers)
-    readings = (
-        (inverse, "R and t seem to map camera points to the world: write the inverse, R^T and -R^T t"),
-        (
-            replace(cameras, R=flip @ R, t=t @ flip),
-            "they seem to look along -z, as in OpenGL: negate rows 2 and 3 of R and t",
-        ),
-        (
-            replace(cameras, R=flip @ R.mT, t=cameras.centers @ flip),
-            "R and t seem to map points of OpenGL's cameras to the world, as Blender's do: invert them and negate rows "
-            "2 and 3",
-        ),
-    )
-    given = (int(coverage.sees.sum()), _widest_angle(cameras, coverage))
+    readings = {
+        "inverse_poses": replace(cameras, R=R.mT, t=cameras.centers),
+        "opengl_poses": replace(cameras, R=flip @ R, t=t @ flip),
+        "inverse_opengl_poses": replace(cameras, R=flip @ R.mT, t=cameras.centers @ flip),
+    }
+    num_now, degrees_now = int(coverage.sees.sum()), _widest_angle(cameras, coverage)
     best = (0, 0.0, "")
-    for reading, what in readings:
+    for code, reading in readings.items():
         if not bool(is_coincident(reading).all()):
             found = find_coverage(reading)
-            best = max(best, (int(found.sees.sum()), round(_widest_angle(reading, found), 3), what))
-    num, angle, what = best
-    if num < CAMERAS.all * len(cameras):
+            best = max(best, (int(found.sees.sum()), round(_widest_angle(reading, found), 3), code))
+    num, degrees, code = best
+    is_better = num_now < CAMERAS.most * len(cameras) or degrees_now * CAMERAS.wider < degrees
+    if num < CAMERAS.all * len(cameras) or not is_better:
         return None
-    if given[0] < CAMERAS.most * len(cameras):
-        return f"the cameras do not look at one place; {what}, and {num} of {len(cameras)} would"
-    if given[1] * CAMERAS.wider < angle:
-        facts = f"the cameras look from directions that differ by {given[1]:.0f} degrees only"
-        return f"{facts}; {what}, and they differ by {angle:.0f}"
-    return None
+    now = {"num_now": num_now, "degrees_now": degrees_now, "total": len(cameras)}
+    return code, "error", None, {"num": num, "degrees": degrees, **now}
 
 
 def _widest_angle(cameras: Cameras, coverage: Coverage) -> float:

@@ -14,46 +14,45 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mvseg.checks.finding import Finding, Rule, list_findings
-from mvseg.checks.groups import NEXT_STEP
-from mvseg.checks.numbers import AGREEMENT, FEATURES
+from mvseg.checks.numbers import FEATURES
 from mvseg.checks.photo_matches import PhotoMatches
-from mvseg.formats.find_views import name_views
+from mvseg.findings.finding import Finding, Rule, list_findings
 from mvseg.scene import Cameras
 
 Floats = NDArray[np.float64]
 
 FACTORS = np.exp(np.linspace(-1, 1, 101))  # of the focal length, in steps of 2 %; the middle one is 1
 
-ONE_STEP = "it has the pose of another photo, or was moved; correct it or leave it out"
-QUESTION = "do R and t map world points to the camera, and does each camera belong to its photo?"
 
-
-def distance_findings(
-    matches: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...], *, only_focal: bool = False
-) -> list[Finding]:
+def distance_findings(matches: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """How the features of the photos contradict the cameras.
 
     Nothing if too few features match (plain leaves before black cloth), or if most of them do not move between photos:
-    on a turntable, what does not turn says nothing about the cameras. With `only_focal` poses are skipped: masks have
-    warned of them already.
+    on a turntable, what does not turn says nothing about the cameras.
     """
-    num_still = sum(pair.num_still for pair in matches)
-    if num_still > sum(pair.xy.shape[1] for pair in matches):
-        return []
-    significant = [pair for pair in matches if pair.is_significant]
+    significant = list_significant(matches)
     factor = focal_factor(significant, cameras)
     rules: list[Rule] = []
     if factor != 1:
         before, after = (_median_px(significant, cameras, each) for each in (1.0, factor))
-        facts = f"features of the photos miss their epipolar lines by {before:.1f} px, and by {after:.1f} px with that"
-        what = f"the focal lengths seem wrong, expected about {factor:.2f} times as much ({facts}): is K that of these "
-        what += "photos, of this zoom and in pixels of this size?"
-        rules.append(("error", None, what))
+        rules.append(("focal_lengths_wrong", "error", None, {"factor": factor, "before": before, "after": after}))
         cameras = scale_focal(cameras, factor)
-    if not only_focal:
-        rules += _pose_rules(significant, cameras, names)
-    return list_findings("poses", rules, names)
+    return list_findings([*rules, *_pose_rules(significant, cameras)], names)
+
+
+def list_significant(matches: Sequence[PhotoMatches]) -> list[PhotoMatches]:
+    """The pairs of photos that say something about their cameras; none if most features do not move."""
+    num_still = sum(pair.num_still for pair in matches)
+    is_still = num_still > sum(pair.xy.shape[1] for pair in matches)
+    return [] if is_still else [pair for pair in matches if pair.is_significant]
+
+
+def groups_that_fit(significant: Sequence[PhotoMatches], cameras: Cameras) -> NDArray[np.int64]:
+    """(V,) number of the group of each view: pairs of photos whose features fit the cameras link them."""
+    fitting = [pair.views for pair in significant if _fitting_share(pair, cameras) > FEATURES.agrees]
+    first, second = np.array(fitting, int).reshape(-1, 2).T
+    links = coo_array((np.ones(len(first)), (first, second)), (len(cameras), len(cameras)))
+    return np.asarray(connected_components(links, directed=False)[1], np.int64)
 
 
 def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
@@ -112,39 +111,42 @@ def _median_px(matches: Sequence[PhotoMatches], cameras: Cameras, factor: float 
     return float(np.median(medians))
 
 
-def _pose_rules(significant: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Rule]:
-    """The pairs of views that contradict their cameras, as one rule; one pair among others may be a mistake."""
-    shares = []  # of the features that fit one fundamental matrix: those that fit that of the cameras
-    for pair in significant:
-        fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < FEATURES.offset * pair.unit_px
-        shares.append(float(fits.sum() / pair.is_rigid.sum()))
-    wrong = [pair for pair, share in zip(significant, shares, strict=True) if share < FEATURES.contradicts]
+def _fitting_share(pair: PhotoMatches, cameras: Cameras) -> float:
+    """Share of the features that fit one fundamental matrix, of which that of the cameras is fitted, too."""
+    fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < FEATURES.offset * pair.unit_px
+    return float(fits.sum() / pair.is_rigid.sum())
+
+
+def _pose_rules(significant: Sequence[PhotoMatches], cameras: Cameras) -> list[Rule]:
+    """The rule about each group of views whose cameras contradict most of the pairs of photos with them, or the one
+    about all cameras. A cause explains most of the wrong pairs: a few may come of leaves that moved."""
+    wrong = [pair for pair in significant if _fitting_share(pair, cameras) < FEATURES.contradicts]
     if not wrong or (len(wrong) == 1 and len(significant) > 1):
         return []
-    agreeing = [pair.views for pair, share in zip(significant, shares, strict=True) if share > FEATURES.agrees]
-    facts = f"in {len(wrong)} of {len(significant)} pairs of photos they miss by {_median_px(wrong, cameras):.0f} px"
-    few, many = _sides(agreeing, [pair.views for pair in wrong], len(names))
-    if not few:
-        return [("error", None, f"features of the photos contradict the cameras ({facts}): {QUESTION}")]
-    between = " and those of ".join(name_views(side, names, shown=AGREEMENT.named) for side in (few, many))
-    step = ONE_STEP if len(few) == 1 else NEXT_STEP
-    return [("error", few, f"features of the photos do not fit both the cameras of {between} ({facts}): {step}")]
+    group = groups_that_fit(significant, cameras)
+    sizes = np.bincount(group)
+    largest = max(range(len(sizes)), key=lambda each: (sizes[each], np.flatnonzero(group == each)[0]))
+    others = [np.flatnonzero(group == each).tolist() for each in range(len(sizes)) if each != largest]
+    rules: list[Rule] = []
+    explained: set[tuple[int, int]] = set()
+    # the groups beside the largest one; where these are most views, the largest one beside them
+    for views in others if 2 * sizes[largest] >= len(group) else [np.flatnonzero(group == largest).tolist()]:
+        bad, with_it = (
+            [pair for pair in pairs if (pair.views[0] in views) != (pair.views[1] in views)]
+            for pairs in (wrong, significant)
+        )
+        if len(bad) > max(1, len(with_it) / 2):
+            explained |= {pair.views for pair in bad}
+            code = "features_off_one" if len(views) == 1 else "features_off_group"
+            rules.append((code, "error", views, _count_wrong(bad, with_it, cameras)))
+    if len(explained) > len(wrong) / 2 and sizes[largest] > 1:
+        return rules
+    if len(wrong) > len(significant) / 2:
+        return [("features_contradict", "error", None, _count_wrong(wrong, significant, cameras))]
+    return []
 
 
-def _sides(
-    agreeing: Sequence[tuple[int, int]], wrong: Sequence[tuple[int, int]], num: int
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Fewer and more views that contradict each other: of the groups of views that agree, the smallest one that is in
-    all wrong pairs, and all others that are in some; empty where there is none."""
-    if not agreeing:
-        return (), ()
-    first, second = np.array(agreeing).T
-    group = connected_components(coo_array((np.ones(len(first)), (first, second)), (num, num)), directed=False)[1]
-    pairs = [{int(group[i]), int(group[j])} for i, j in wrong]
-    shared = sorted(set.intersection(*pairs), key=lambda each: int((group == each).sum()))
-    others = set().union(*pairs) - set(shared[:1])
-    if not shared or not others:
-        return (), ()
-    sides = [tuple(np.flatnonzero(np.isin(group, side)).tolist()) for side in (shared[:1], sorted(others))]
-    few, many = sorted(sides, key=lambda side: (len(side), side))
-    return few, many
+def _count_wrong(
+    wrong: Sequence[PhotoMatches], compared: Sequence[PhotoMatches], cameras: Cameras
+) -> dict[str, str | float | tuple[str, ...]]:
+    return {"wrong": len(wrong), "compared": len(compared), "px": _median_px(wrong, cameras)}

@@ -11,14 +11,11 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.checks.finding import Finding, Level, list_findings
 from mvseg.checks.numbers import AGREEMENT
 from mvseg.checks.poses import PoseAgreement, is_sure, view_agreement
-from mvseg.formats.find_views import name_views
+from mvseg.findings.finding import Finding, Level, list_findings
 
 Floats = NDArray[np.float64]
-
-NEXT_STEP = "were they calibrated separately, with two scales or axes? Calibrate them together, or use one group"
 
 
 def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
@@ -43,18 +40,16 @@ def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
 
 
 def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
-    """One finding where the V views, named, fall into groups, about all but the largest; none for one world."""
+    """One finding for each group that the V views, named, fall into, but for the largest; none for one world."""
     groups = world_groups(pairs)
     if len(groups) < 2:
         return []
     members = [np.array(group) for group in groups]
     within = np.concatenate([_upper(pairs.fitting, group) for group in members])
     between = np.concatenate([_block(pairs.fitting, one, other) for one, other in combinations(members, 2)])
-    facts = f"{np.nanmean(between):.0%} of the masks fit instead of {np.nanmean(within):.0%}"
-    each = " and ".join(f"within {name_views(group, names, shown=AGREEMENT.named)}" for group in groups)
+    shares = {"within": float(np.nanmean(within)), "between": float(np.nanmean(between))}
     level: Level = "error" if is_sure(pairs) else "warning"
-    what = f"masks and poses agree {each}, but not between these groups ({facts}): {NEXT_STEP}"
-    return list_findings("poses", [(level, sorted(view for group in groups[1:] for view in group), what)], names)
+    return list_findings([("separate_worlds", level, group, shares) for group in groups[1:]], names)
 
 
 def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:

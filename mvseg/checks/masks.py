@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.checks.numbers import IMAGES
+from mvseg.findings.finding import Finding, Rule, list_findings
 from mvseg.formats.masks.faults import mask_faults
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -16,11 +16,16 @@ from mvseg.scene import Cameras
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """The findings about the D masks of V views."""
-    rules: list[Rule] = [("error", *fault) for fault in mask_faults(regions, cameras.sizes.tolist())]
+    rules = mask_faults(regions, cameras.sizes.tolist())
     if len(regions):
         rules += [*_count_rules(regions.num_per_view.numpy()), *_size_rules(regions, cameras)]
         rules.append(_small_component_rule(regions, cameras))
-    return list_findings("masks", rules, names)
+    return list_findings(rules, names)
+
+
+def detected_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+    """The findings about D masks that a detector found: they are cut, if anything."""
+    return list_findings(_size_rules(regions, cameras) if len(regions) else [], names)
 
 
 def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
@@ -29,33 +34,21 @@ def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
         return []
     usual = float(np.median(counts[counts > 0]))
     few = np.flatnonzero((counts > 0) & (counts < IMAGES.few * usual)).tolist()
-    facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
-    return [
-        ("warning", empty, "there are no masks in {}: is the plant hidden there, or a file missing?"),
-        ("warning", few, f"{facts}: are some missing?"),
-    ]
+    values = {"count": int(counts[counts > 0].min()), "usual": usual}
+    return [("views_without_masks", "warning", empty, {}), ("few_masks", "warning", few, values)]
 
 
 def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
     rules: list[Rule] = []
-    areas = regions.areas.numpy()
+    areas, total = regions.areas.numpy(), len(regions)
     tiny = areas < IMAGES.tiny_px
     if tiny.mean() > IMAGES.many:
-        sizes = f"fewer than {IMAGES.tiny_px} pixels (median {np.median(areas):.0f})"
-        what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
-        rules.append(("warning", None, what))
-    if what := describe_cut(regions, cameras):
-        rules.append(("warning", None, what))
-    return rules
-
-
-def describe_cut(regions: Regions, cameras: Cameras) -> str:
-    """The sentence about D masks that the borders of V photos cut, where they are many; "" elsewhere."""
+        values = {"px": IMAGES.tiny_px, "median": float(np.median(areas))}
+        rules.append(("tiny_masks", "warning", None, {"count": int(tiny.sum()), "total": total, **values}))
     cut = touches_border(regions, cameras)
-    if not len(regions) or float(cut.float().mean()) <= IMAGES.many:
-        return ""
-    what = f"{int(cut.sum())} of {len(regions)} masks touch the border of their photo, and cut leaves come out small"
-    return f"{what}: step back, or add photos"
+    if float(cut.float().mean()) > IMAGES.many:
+        rules.append(("cut_masks", "warning", None, {"count": int(cut.sum()), "total": total}))
+    return rules
 
 
 def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
@@ -68,7 +61,7 @@ def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
         if reach > IMAGES.beyond * longest[view]:
             views.add(view)
-    return "warning", sorted(views), "masks of {} have stray pixels far from the rest of them: remove small components"
+    return "stray_pixels", "warning", sorted(views), {}
 
 
 def touches_border(regions: Regions, cameras: Cameras) -> Tensor:

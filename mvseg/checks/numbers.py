@@ -46,7 +46,6 @@ class AgreementNumbers:
     chance: float = 0.06  # share of the masks that fit where poses and masks have nothing to do with each other
     apart: float = 0.5  # share that fits between two worlds, in that within them, at most; in one world, more fit
     smallest: int = 2  # definition: views of a group; one alone is for `view_agreement`
-    named: int = 12  # views of a group that a sentence names
     # On 65 real plants and dates with sound masks it is 0.47 and more, but for 0.28 on a basil of 30 leaves that hide
     # each other; where the masks of a simulated plant are turned, it is 0.29 and 0.26.
     low: float = 0.4  # share that fits in the median view, below which a user is told

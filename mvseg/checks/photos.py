@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
 from mvseg.formats.photo_content import PhotoContent, measure_content
-from mvseg.formats.photos import Photos, describe_folder, photo_bits
+from mvseg.formats.photos import Photos, list_photos_in, photo_bits
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 
@@ -59,19 +59,15 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
     rules: list[Rule] = []
     if missing:
         first = scene.views[missing[0]].path
-        beside = describe_folder(first.parent)
-        rules.append(
-            ("error", missing, f"{{}}: no photo, the first is {first}; add it, or take its camera out{beside}")
-        )
-        what = f"there are neither photos nor masks: add {first} and the others, or give --masks{beside}"
-    if len(missing) == len(facts):
-        note = "there are no photos: traits have no colours, and overlays are grey"
-        rules = [("note", None, note) if has_masks else ("error", None, what)]
-    for view, each in enumerate(facts):
-        if each.problem:
-            rules.append(("error", (view,), f"the photo of {{}} cannot be read ({each.problem}): export it again"))
-    rules += [*_size_rules(facts, scene), *_content_rules(facts), *_exposure_rules(facts)]
-    return list_findings("photos", rules, names)
+        where: Values = {"path": str(first), "found": list_photos_in(first.parent)}
+        if len(missing) < len(facts):
+            rules.append(("missing_photos", "error", missing, where))
+        else:
+            rules.append(("no_photos", "note", None, {}) if has_masks else ("no_photos_no_masks", "error", None, where))
+    rules += [
+        ("broken_photo", "error", (view,), {"reason": each.problem}) for view, each in enumerate(facts) if each.problem
+    ]
+    return list_findings([*rules, *_size_rules(facts, scene), *_content_rules(facts), *_exposure_rules(facts)], names)
 
 
 def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
@@ -81,14 +77,10 @@ def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
             by_size[*each.size, *camera].append(view)
     rules: list[Rule] = []
     for (width, height, *camera), views in by_size.items():
-        step = "scale K with the photos, or use the photos that the cameras were calibrated on"
-        if [height, width] == camera:
-            step = "the photos were turned after the calibration; turn them back"
-        what = f"{{}}: the photo is {width} x {height}, its camera says {camera[0]} x {camera[1]}: {step}"
-        rules.append(("error", views, what))
+        sizes = {"width": width, "height": height, "camera_width": camera[0], "camera_height": camera[1]}
+        rules.append(("photo_turned" if [height, width] == camera else "photo_size", "error", views, sizes))
     turned = [view for view, each in enumerate(facts) if each.turned]
-    what = "EXIF turns {} for display: cameras and masks must be of the pixels as stored"
-    return [*rules, ("warning", turned, what)]
+    return [*rules, ("turned_for_display", "warning", turned, {"count": len(turned)})]
 
 
 def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
@@ -98,17 +90,16 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     dark = [view for view in shown if facts[view].content.level < IMAGES.dark]
     burnt = [view for view in shown if facts[view].content.burnt > IMAGES.burnt]
     grey = [view for view in shown if facts[view].content.grey]
-    few = "detectors will find few leaves there"
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
         same[facts[view].digest].append(view)
     twins = [views for views in same.values() if len(views) > 1]
     return [
-        ("error", blank, "the photos of {} show nothing (one colour all over): leave them out"),
-        ("warning", dark, f"the photos of {{}} are nearly black: {few}"),
-        ("warning", burnt, f"the photos of {{}} are overexposed: {few}"),
-        ("note", grey, "the photos of {} are grey: leaf colours and greenness are not measured in them"),
-        *(("error", views, "{} are the same photo: check which one belongs to which camera") for views in twins),
+        ("blank_photo", "error", blank, {}),
+        ("dark_photo", "warning", dark, {}),
+        ("overexposed_photo", "warning", burnt, {}),
+        ("grey_photo", "note", grey, {}),
+        *(("same_photo", "error", views, {}) for views in twins),
     ]
 
 
@@ -119,8 +110,7 @@ def _exposure_rules(facts: list[PhotoFacts]) -> list[Rule]:
         return []
     apart = np.abs(exposures - np.nanmedian(exposures))
     others = np.flatnonzero(apart > IMAGES.stops).tolist()  # NaN is no more than anything
-    what = f"by EXIF, the exposures of {{}} are up to {np.nanmax(apart):.1f} stops from the usual one"
-    return [("note", others, f"{what}: leaf colours differ as much; fix exposure and white balance")]
+    return [("other_exposure", "note", others, {"stops": float(np.nanmax(apart))})]
 
 
 def _read_facts(photos: Photos, view: int) -> PhotoFacts:

@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.checks.finding import Finding, Level, Rule, list_findings
 from mvseg.checks.masks import touches_border, without_small_components
 from mvseg.checks.numbers import AGREEMENT
+from mvseg.findings.finding import Finding, Level, Rule, list_findings
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -137,23 +137,17 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     if not len(compared):
         return []
     level: Level = "error" if is_sure(pairs) else "warning"
-    rules: list[Rule] = []
     if not view.agree:
-        share, px = np.nanmedian(view.fitting), np.nanmedian(view.offset_px)
-        facts = f"only {share:.0%} of the masks end where others do, epipolar lines miss by {px:.0f} px or more"
-        question = "do R and t map world points to the camera, and does each mask belong to its photo?"
-        rules = [(level, None, f"masks and poses of most views disagree ({facts}): {question}")]
-        return list_findings("poses", rules, names)
-    for index in view.off:
-        facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
-        step = "it has the pose or the masks of another photo, or was moved; correct it or leave it out"
-        rules.append((level, (index,), f"{{}} agrees with none of the others ({facts} or more): {step}"))
+        share, px = float(np.nanmedian(view.fitting)), float(np.nanmedian(view.offset_px))
+        return list_findings([("poses_disagree", level, None, {"share": share, "px": px})], names)
+    rules: list[Rule] = [
+        ("view_off", level, (each,), {"share": float(view.fitting[each]), "px": float(view.offset_px[each])})
+        for each in view.off
+    ]
     missed = np.flatnonzero(view.offset_px >= AGREEMENT.offset * pairs.unit_px).tolist()
     missing = [index for index in missed if index not in view.off] if len(names) >= AGREEMENT.few_views else []
-    most = view.offset_px[missing].max(initial=0)
-    step = "calibrate again, or adjust the poses in COLMAP (bundle adjustment)"
-    rules.append(("warning", missing, f"epipolar lines of {{}} miss by up to {most:.0f} px: {step}"))
-    return list_findings("poses", rules, names)
+    most = float(view.offset_px[missing].max(initial=0))
+    return list_findings([*rules, ("lines_miss", "warning", missing, {"px": most})], names)
 
 
 def is_sure(pairs: PoseAgreement) -> bool:

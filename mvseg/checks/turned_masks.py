@@ -7,30 +7,31 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvseg.checks.finding import Finding
 from mvseg.checks.numbers import AGREEMENT
 from mvseg.checks.poses import PoseAgreement, is_sure, pairwise_agreement, view_agreement
+from mvseg.findings.finding import Finding
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 
-def low_fit_findings(regions: Regions, cameras: Cameras, agreement: PoseAgreement) -> list[Finding]:
+def low_fit_findings(
+    regions: Regions, cameras: Cameras, agreement: PoseAgreement, *, is_detected: bool = False
+) -> list[Finding]:
     """Nothing where masks fit in most views, or masks or views are few. Else an error, if masks that are turned by 180
-    degrees fit twice as well; and a warning, if not."""
+    degrees fit twice as well; and a note, if not: leaves that hide each other do that, too. Masks that a detector found
+    are not turned."""
     if not agreement.num_masks.any() or not is_sure(agreement):
         return []
-    share = np.nanmedian(view_agreement(agreement).fitting)
+    share = float(np.nanmedian(view_agreement(agreement).fitting))
     if share >= AGREEMENT.low:
         return []
+    if is_detected:
+        return [Finding("low_fit_detected", values={"share": share}, level="note")]
     turned = pairwise_agreement(turn_by_180(regions, cameras), cameras)
-    other = np.nanmedian(view_agreement(turned).fitting) if turned.num_masks.any() else 0.0
+    other = float(np.nanmedian(view_agreement(turned).fitting)) if turned.num_masks.any() else 0.0
     if other > AGREEMENT.turned * share:
-        facts = f"{share:.0%} of the masks fit those of other views, {other:.0%} if they are turned by 180 degrees"
-        step = "they must be of the photos as stored, not as EXIF turns them"
-        return [Finding(where="masks", what=f"{facts}: {step}", level="error")]
-    facts = f"only {share:.0%} of the masks fit those of other views, in most views"
-    reasons = "leaves hide each other, or the masks are of other photos or of turned ones"
-    return [Finding(where="masks", what=f"{facts}: {reasons}", level="warning")]
+        return [Finding("turned_masks", values={"share": share, "turned": other}, level="error")]
+    return [Finding("low_fit", values={"share": share}, level="note")]
 
 
 def turn_by_180(regions: Regions, cameras: Cameras) -> Regions:

@@ -5,9 +5,7 @@ page of `mvseg target`. Exit code 0: nothing would go wrong; 1: something would;
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,20 +14,20 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared
 from mvseg.errors import InputError, collect_warnings
+from mvseg.findings.finding import Finding, keep_causes
 from mvseg.system.say import say
 
 if TYPE_CHECKING:
     from mvseg.checks.check_scene import Check
-    from mvseg.checks.finding import Finding
 
 WRONG = 1  # exit code
 CHECK_FILE, PLAN_FILE, TARGET_FILE = "check.json", "cameras.png", "target.json"
-NOTHING_TO_SEE = "there are neither photos nor masks"
 
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
-    parser.add_argument("scene", type=Path, help="scene folder (photos, cameras of any kind in docs/formats.md)")
+    help_scene = "scene folder (photos, cameras of any kind in docs/formats.md), or a result of mvseg infer"
+    parser.add_argument("scene", type=Path, help=help_scene)
     help_out = "folder for check.json (target.json), and for cameras.png, a plan (default: nothing is written)"
     parser.add_argument("--out", type=Path | None, help=help_out)
     add_shared(parser, "masks", "categories", "coco_crowd", "quiet")
@@ -44,41 +42,62 @@ def run(args: Namespace) -> int:
         return _run_target(args)
     if args.bar is not None:
         raise InputError("--bar is of the page of mvseg target, expected --target with it")
-    from mvseg.checks.check_scene import check_scene
-    from mvseg.formats.scene_folder import load_masks, load_scene
-    from mvseg.results.earlier import check_file
-    from mvseg.runs.request import find_given
+    from mvseg.results.earlier import RUN_FILE, check_file
 
     if args.out is not None:
         check_file(args.out / CHECK_FILE, b'"findings"')
         if not (args.out / CHECK_FILE).exists():  # an earlier check wrote both
             check_file(args.out / PLAN_FILE, None)
-    wanted = () if args.categories is None else [name.strip() for name in args.categories.split(",")]
-    found: list[Finding] = []
-    regions, unread = None, None
-    with _findings("cameras", found):
-        scene = load_scene(args.scene)
-    if args.masks is not None:
-        try:
-            with _findings("masks", found):
-                masks = find_given(args.scene, args.masks)
-                regions = load_masks(scene, masks, crowd=args.coco_crowd, categories=wanted)
-        except InputError as error:  # the findings about cameras and photos may explain it
-            unread = error
-    check = check_scene(scene, regions)
-    found = [each for each in found if not any(each.what.endswith(own.what) for own in check.findings)]  # as errors
-    # without readable masks, missing photos are no fault of their own
-    found += [each for each in check.findings if unread is None or not each.what.startswith(NOTHING_TO_SEE)]
-    _print_table(check)
-    for finding in sorted(found, key=lambda each: ("error", "warning", "note").index(each.level)):
-        say(f"{finding.level:8} {finding.where:8} {finding.what}")
-    if not found and unread is None:
+    if (args.scene / RUN_FILE).is_file():
+        if args.masks is not None:
+            raise InputError(f"--masks has no effect: {args.scene} is a result, which has its masks")
+        check, findings, unread = *_check_result(args.scene), None
+    else:
+        check, findings, unread = _check_folder(args)
+    _print_table(check, args.scene)
+    for finding in findings:
+        say(f"{finding.level:8} {finding.topic:8} {finding}")
+    if not findings and unread is None:
         say("no problems found")
     if args.out is not None:
-        _write(args.out, check, found)
+        _write(args.out, check, findings)
     if unread is not None:
         raise unread
-    return WRONG if any(finding.level == "error" for finding in found) else 0
+    return WRONG if any(finding.level == "error" for finding in findings) else 0
+
+
+def _check_folder(args: Namespace) -> tuple[Check, tuple[Finding, ...], InputError | None]:
+    """The check of a scene folder, all findings, and why its masks cannot be read."""
+    from mvseg.checks.check_scene import check_scene
+    from mvseg.formats.scene_folder import load_masks, load_scene
+    from mvseg.runs.request import find_given
+
+    wanted = () if args.categories is None else [name.strip() for name in args.categories.split(",")]
+    regions, unread = None, None
+    with collect_warnings() as noticed:
+        scene = load_scene(args.scene)
+        if args.masks is not None:
+            try:
+                masks = find_given(args.scene, args.masks)
+                regions = load_masks(scene, masks, crowd=args.coco_crowd, categories=wanted)
+            except InputError as error:  # the findings about cameras and photos may explain it
+                unread = error
+    check = check_scene(scene, regions)
+    # without readable masks, missing photos are no fault of their own
+    found = [each for each in check.findings if unread is None or each.code != "no_photos_no_masks"]
+    return check, keep_causes((*noticed, *found)), unread
+
+
+def _check_result(folder: Path) -> tuple[Check, tuple[Finding, ...]]:
+    """The check of the scene and the masks of a result, and what else its run found."""
+    from mvseg.checks.check_scene import check_scene
+    from mvseg.results.read import load_result
+
+    result = load_result(folder)
+    assert result.run is not None
+    check = check_scene(result.scene, result.regions, is_detected=result.run.mask_kind is None)
+    others = [each for each in result.run.list_findings() if each.topic in ("leaves", "edits", "run")]
+    return check, keep_causes((*check.findings, *others))
 
 
 def _run_target(args: Namespace) -> int:
@@ -108,25 +127,12 @@ def _run_target(args: Namespace) -> int:
     return 0 if check.is_right else WRONG
 
 
-@contextmanager
-def _findings(where: str, found: list[Finding]) -> Iterator[None]:
-    """Take what a reader warns of as findings."""
-    from mvseg.checks.finding import Finding
-
-    said: list[str] = []
-    try:
-        with collect_warnings() as said:
-            yield
-    finally:
-        found += [Finding(where=where, what=what, level="warning") for what in said]
-
-
-def _print_table(check: Check) -> None:
+def _print_table(check: Check, place: Path) -> None:
     from mvseg.checks.cameras import field_of_view
 
     scene, cameras = check.scene, check.scene.cameras
     up = "unknown" if scene.up is None else "{:.2f} {:.2f} {:.2f}".format(*scene.up)
-    say(f"{scene.source}: {len(cameras)} cameras, unit {scene.unit or 'unknown'}, up {up}")
+    say(f"{place}: {len(cameras)} cameras, unit {scene.unit or 'unknown'}, up {up}")
     sees, photos = check.coverage.sees, sum(each.size is not None for each in check.photos)
     say(f"{int(sees.sum())} of {len(cameras)} look at one point; {photos} photos", end="")
     say("" if check.regions is None else f"; {len(check.regions)} masks", end="\n\n")
@@ -182,13 +188,13 @@ def _or_none(value: float) -> float | None:
     return None if np.isnan(value) else float(value)
 
 
-def _write(out: Path, check: Check, findings: list[Finding]) -> None:
+def _write(out: Path, check: Check, findings: Sequence[Finding]) -> None:
     from mvseg.checks.camera_plan import draw_cameras
     from mvseg.formats.image_file import write_png
     from mvseg.system.atomic import write_text_whole, write_whole
 
-    off = {view for each in findings if each.where == "poses" and each.level == "error" for view in each.views}
-    content = {"scene": check.scene.name, "findings": [asdict(each) for each in findings], "views": _rows(check)}
+    off = {view for each in findings if each.topic == "poses" and each.level == "error" for view in each.views}
+    content = {"scene": check.scene.name, "findings": [each.as_json() for each in findings], "views": _rows(check)}
     out.mkdir(parents=True, exist_ok=True)
     write_text_whole(out / CHECK_FILE, json.dumps(content, indent=1) + "\n")
     picture = draw_cameras(check.scene, check.coverage, tuple(sorted(off)))

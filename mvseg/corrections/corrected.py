@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
 
@@ -24,11 +25,12 @@ class Fate:
     problem: str = ""
 
     @property
-    def message(self) -> str:
-        """A sentence, if the edit was not applied, or is odd; "" otherwise."""
+    def finding(self) -> Finding | None:
+        """If the edit was not applied, or is odd; None otherwise."""
         if not self.problem and self.fate in (APPLIED, PASSED):
-            return ""
-        return f"correction {self.edit} ({self.op}): {': '.join(filter(None, (self.fate, self.problem)))}"
+            return None
+        why = ": ".join(filter(None, (self.fate, self.problem)))
+        return Finding("edit", values={"edit": self.edit, "op": self.op, "why": why})
 
 
 @dataclass(frozen=True)
@@ -77,11 +79,6 @@ class Corrected:
     everywhere: tuple[Whole, ...]
     refused: tuple[Refused, ...]
     fates: tuple[Fate, ...]
-
-    @property
-    def messages(self) -> list[str]:
-        """A sentence for each edit that was not applied, or is odd."""
-        return [each.message for each in self.fates if each.message]
 
 
 def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mvseg.corrections.file import Corrections, Edit, Link, PhotoMark, TrackLink
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.find_views import find_views
 from mvseg.formats.photos import Photos
 from mvseg.scene import Scene
@@ -65,7 +66,7 @@ def check_made_for(corrections: Corrections, photos: Photos) -> None:
     """
     scene, source = photos.scene, corrections.source or "the corrections"
     if corrections.source is not None and views_of(corrections) and not corrections.photos:
-        warn(f"{source}: does not say which photos it was made for, and is taken for this scene's")
+        warn(Finding("edits_of_unknown_photos", str(source)))
     named = find_views(list(corrections.photos), scene, source=Path(str(source)))
     for (name, stated), view in zip(corrections.photos.items(), named, strict=True):
         if view is None:

@@ -18,6 +18,7 @@ from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
 from mvseg.matching.config import MatchConfig
 from mvseg.system.file_hash import hash_files
@@ -71,8 +72,8 @@ def detect_scene(
         boxes = boxes_for_second_pass(look.sure.masks, cameras, longest=model.transform.max_size)
         look = look if boxes is None else look_at(boxes)
     if num_full := sum(len(each["scores"]) >= DETECTION.most_proposals for each in look.detections):
-        most = f"the best {DETECTION.most_proposals} are taken"
-        warn(f"the detector proposes very many masks in {num_full} photos ({most}): does it know such plants?")
+        values = {"count": num_full, "most": DETECTION.most_proposals}
+        warn(Finding("very_many_proposals", values=values))
     return look
 
 

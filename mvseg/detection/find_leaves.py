@@ -13,6 +13,7 @@ from mvseg.detection.crops import crop_cameras, place_crops
 from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
 from mvseg.errors import collect_warnings
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
@@ -115,7 +116,7 @@ class Found:
     proposals: Masks
     matched: tuple[Masks, ...]
     report: MatchReport
-    said: tuple[str, ...] = ()
+    said: tuple[Finding, ...] = ()
 
     @property
     def agreed_area(self) -> float:

@@ -82,7 +82,8 @@ def match_proposals(
                 caught.clear()
                 matching = rematch(proposals.select(keep[stays]))
     for each in caught:
-        warn(each.message)
+        if isinstance(each.message, Warning):
+            warn(each.message)
     return matching
 
 

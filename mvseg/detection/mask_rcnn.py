@@ -18,7 +18,7 @@ from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError, warn
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match import describe_disagreement
+from mvseg.matching.match import find_disagreement
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.verification.missing_parts import find_missing_parts
@@ -226,9 +226,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
 
 def _said_of(matching: Matching) -> Matching:
-    """The same; warns (InputWarning) where the views hardly agree, see `describe_disagreement`."""
-    if said := describe_disagreement(matching):
-        warn(said)
+    """The same; warns (InputWarning) where the views disagree, see `find_disagreement`."""
+    if (disagreement := find_disagreement(matching, is_detected=True)) is not None:
+        warn(disagreement)
     return matching
 
 

@@ -16,7 +16,8 @@ from pycocotools import mask as coco_mask
 from pydantic import BaseModel, FiniteFloat, RootModel, TypeAdapter, ValidationError
 
 from mvseg.errors import InputError, faults_of, warn
-from mvseg.formats.find_views import PhotoSet, base_name, find_views, list_some
+from mvseg.findings.finding import Finding, Values, list_some
+from mvseg.formats.find_views import PhotoSet, base_name, find_views
 from mvseg.formats.image_file import describe_turn
 from mvseg.formats.json_file import Int64, Items, check_content, load_json, read_json
 from mvseg.formats.masks.found_mask import check_categories
@@ -122,13 +123,12 @@ def read_coco(
             continue
         chosen[view].append((place, annotation))
     if num_crowds:
-        what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
-        warn(f"{path}: {num_crowds} annotations with iscrowd are {what}")
+        code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
+        warn(Finding(code, str(path), {"count": num_crowds, "option": "--coco_crowd"}))
     if num_boxes:
-        what = f"{num_boxes} annotations have no mask (a box at most)"
         if not counts.total():
-            raise InputError(f"{path}: {what}, and no others are there")
-        warn(f"{path}: {what} and are left out")
+            raise InputError(f"{path}: {num_boxes} annotations have no mask (a box at most), and no others are there")
+        warn(Finding("annotations_without_mask", str(path), {"count": num_boxes}))
     with faults_of(path):
         check_corners(annotation.segmentation for view in chosen for _, annotation in view)
     check_categories(counts, categories, known=names.values(), source=path)
@@ -185,14 +185,14 @@ def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) ->
     ids = list(dict.fromkeys(result.image_id for result in results))
     numbers = [image_id for image_id in ids if isinstance(image_id, int)]
     known = [number for number in numbers if number in by_number]
-    beside = "put the JSON of its data set, which lists the images, beside it"
     if known and len(known) < len(numbers):
         other = next(number for number in numbers if number not in by_number)
         reason = f"image_id {known[0]} is the number of a photo, {other} is none"
-        raise InputError(f"{path}: {reason}: image ids of results are those of their data set; {beside}")
+        mend = "put the JSON of its data set, which lists the images, beside it"
+        raise InputError(f"{path}: {reason}: image ids of results are those of their data set; {mend}")
     if known:
-        first = by_number[known[0]]
-        warn(f"{path}: image ids are taken for the numbers of photos ({known[0]}: {first}); if they are not, {beside}")
+        values: Values = {"number": known[0], "photo": by_number[known[0]]}
+        warn(Finding("ids_taken_for_numbers", str(path), values))
     names = [by_number.get(each, str(each)) if isinstance(each, int) else each for each in ids]
     return [CocoImage(id=each, file_name=name, width=0, height=0) for each, name in zip(ids, names, strict=True)]
 
@@ -222,7 +222,7 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     listed = enumerate(coco.annotations, start=1)
     orphans = [place if one.id is None else one.id for place, one in listed if str(one.image_id) not in image_ids]
     if orphans:
-        warn(f"{path}: {len(orphans)} annotations refer to no image in the file, the first is annotation {orphans[0]}")
+        warn(Finding("orphans", str(path), {"count": len(orphans), "first": orphans[0]}))
     if len(image_ids) < len(coco.images):
         raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")
     names = [image.file_name for image in coco.images]
@@ -233,8 +233,8 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
         raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {found}")
     if missing:
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
-        message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
-        warn(f"{path}: {message}; the file holds {list_some(names)}")
+        counts: Values = {"count": len(missing), "first": first_view, "found": tuple(names)}
+        warn(Finding("images_missing", str(path), counts))
     check_images_once(path, coco, views)
     for image, view in zip(coco.images, views, strict=True):
         width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()

@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding, Values
 from mvseg.formats.find_views import natural_order
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.photos import Photo, build_scene
@@ -37,9 +38,9 @@ def find_colmap_model(folder: Path) -> Path | None:
         if counts:
             best = max(counts, key=counts.__getitem__)
             if len(counts) > 1:
-                shown = ", ".join(f"{model.name} with {count} photos" for model, count in counts.items())
-                taken = f"{best.name} is taken, the others have no common world"
-                warn(f"{place}: there are {len(counts)} models ({shown}); {taken}")
+                shown = tuple(f"{model.name} with {count} photos" for model, count in counts.items())
+                taken: Values = {"count": len(counts), "models": shown, "taken": best.name}
+                warn(Finding("several_models", str(place), taken))
             return best
     return None
 
@@ -83,8 +84,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     files = [path for path in sorted(images_folder.rglob("*.*")) if path.name.lower().endswith(PHOTO_SUFFIXES)]
     left_out = [path.relative_to(images_folder).as_posix() for path in files if path not in registered]
     if left_out:
-        what = f"{len(left_out)} photos in images/ have no pose in the model and are left out"
-        warn(f"{model}: {what}, the first is {left_out[0]}")
+        warn(Finding("photos_without_pose", str(model), {"count": len(left_out), "first": left_out[0]}))
     return scene
 
 

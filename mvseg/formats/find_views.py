@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Protocol
 
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.scene import View
 
-SHOWN = 3  # names in a message
 # Roboflow calls the export of 000.jpg "000_jpg.rf.<hash>.jpg".
 ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECASE)
 LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-", re.IGNORECASE)  # its upload of 000.jpg is "5f1c0e7a-000.jpg"
@@ -29,7 +29,9 @@ class PhotoSet(Protocol):
     def source(self) -> Path | None: ...
 
 
-def find_views(names: Sequence[str], scene: PhotoSet, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
+def find_views(
+    names: Sequence[str], scene: PhotoSet, *, source: Path | None, warn_of_loose: bool = False
+) -> list[int | None]:
     """The view that each file name refers to, None for a photo that is not in the scene.
 
     A name refers to a view if it is the path of the view's photo, the last part of that path, either of them with one
@@ -39,13 +41,14 @@ def find_views(names: Sequence[str], scene: PhotoSet, *, source: Path, warn_of_l
     Args:
         names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
         scene: gives the views.
-        source: the file or folder that holds the names; messages name it.
+        source: the file or folder that holds the names; messages name it. None: they do not.
         warn_of_loose: warn (InputWarning) of names that were matched by their base name alone.
 
     Raises:
         InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
     """
-    found = _exact_views(names, scene, source)
+    in_source = "" if source is None else f"{source}: "
+    found = _exact_views(names, scene, in_source)
     open_views = [view for view in range(len(scene.views)) if view not in set(found)]
     bases = [base_name(scene.views[view].name) for view in open_views]
     view_of = {base: view for base, view in zip(bases, open_views, strict=True) if bases.count(base) == 1}
@@ -56,12 +59,12 @@ def find_views(names: Sequence[str], scene: PhotoSet, *, source: Path, warn_of_l
             continue
         if first_of.setdefault(view, name) != name:
             message = f"both {first_of[view]} and {name} could be view {view} ({scene.views[view].name})"
-            raise InputError(f"{source}: {message}, expected the path of its photo")
+            raise InputError(f"{in_source}{message}, expected the path of its photo")
         found[index] = view
     if first_of and warn_of_loose:
         view, name = next(iter(first_of.items()))
-        message = f"{len(first_of)} names fit a photo by the base name only, the first is {name} for "
-        warn(f"{source}: {message}{scene.views[view].name}")
+        first = f"{name} for {scene.views[view].name}"
+        warn(Finding("base_names", str(source), {"count": len(first_of), "first": first}))
     return found
 
 
@@ -92,28 +95,13 @@ def find_file(path: Path) -> Path:
     return place if place.exists() else path
 
 
-def list_some(names: Sequence[str]) -> str:
-    """The first names, for a message: "a, b, c and 12 more", or "nothing"."""
-    distinct = list(dict.fromkeys(names))
-    more = f" and {len(distinct) - SHOWN} more" if len(distinct) > SHOWN else ""
-    return ", ".join(distinct[:SHOWN]) + more if distinct else "nothing"
-
-
-def name_views(views: Sequence[int], names: Sequence[str], *, shown: int = SHOWN) -> str:
-    """The views in a sentence: "view 3 (003)", or "5 views (000, 001, 002 and 2 more)"."""
-    if len(views) == 1:
-        return f"view {views[0]} ({names[views[0]]})"
-    more = f" and {len(views) - shown} more" if len(views) > shown else ""
-    return f"{len(views)} views ({', '.join(names[view] for view in views[:shown])}{more})"
-
-
 def natural_order(name: str) -> list[tuple[int, int | str]]:
     """A key for natural sorting: 2.jpg before 10.jpg."""
     parts = re.split(r"(\d+)", name.lower())
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
 
 
-def _exact_views(names: Sequence[str], scene: PhotoSet, source: Path) -> list[int | None]:
+def _exact_views(names: Sequence[str], scene: PhotoSet, in_source: str) -> list[int | None]:
     """The view of each name by its path or its name, None if neither matches."""
     by_name = {composed(view.name): index for index, view in enumerate(scene.views)}
     by_path: dict[str, list[int]] = defaultdict(list)
@@ -129,6 +117,6 @@ def _exact_views(names: Sequence[str], scene: PhotoSet, source: Path) -> list[in
         fitting = [] if same_name is not None else by_path.get(name) or by_path.get(stem, [])
         if len(fitting) > 1:
             views = " or ".join(f"{i} ({scene.views[i].name})" for i in fitting)
-            raise InputError(f"{source}: image {file_name} could be view {views}, expected its path")
+            raise InputError(f"{in_source}image {file_name} could be view {views}, expected its path")
         found.append(fitting[0] if fitting else same_name)
     return found

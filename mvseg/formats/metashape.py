@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mvseg.errors import InputError, faults_of, warn
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import MAX_SIDE
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, find_photo
@@ -80,10 +80,9 @@ def read_metashape(path: Path) -> Scene:
                 poses = {"chunk_from_cam": chunk_from_master @ offset, "world_from_chunk": world_from_chunk}
                 photos.append(_photo(path.parent, label, sensor, **poses))
     if num_left_out:
-        warn(f"{path}: {num_left_out} cameras are not aligned or not enabled and are left out")
+        warn(Finding("cameras_not_aligned", str(path), {"count": num_left_out}))
     if slaves:
-        what = f"{len(slaves)} slaves of a rig ({list_some(slaves)}) are left out"
-        warn(f"{path}: {what}: the unit of their offset is not known; export the cameras for COLMAP instead")
+        warn(Finding("slaves_left_out", str(path), {"count": len(slaves), "slaves": tuple(slaves)}))
     unit = "" if world_from_chunk is None else "m"
     return build_scene(path.parent, photos, unit=unit, source=path)
 
@@ -118,8 +117,7 @@ def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray,
     if scale <= 0:
         raise InputError(f"the scale of the chunk is {scale:g}, expected a positive number")
     if np.abs(T).max() > GEOCENTRIC:
-        message = f"the world is {np.linalg.norm(T):.3g} m from the origin (geocentric); its translation is left out"
-        warn(f"{path}: {message}")
+        warn(Finding("geocentric", str(path), {"distance": float(np.linalg.norm(T))}))
         T = np.zeros(3)
     return R, T, scale
 

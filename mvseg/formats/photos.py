@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError, check_arguments, faults_of, warn
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.image_file import (
     MAX_PIXELS,
     PHOTO_SUFFIXES,
@@ -86,7 +86,7 @@ def build_scene(
         if posixpath.dirname(posixpath.normpath(photo.file)) != posixpath.dirname(posixpath.normpath(file)):
             moved.append(f"{file} for {photo.file}")
     if moved:
-        warn(f"{source}: {len(moved)} photos are matched by their names alone, the first is {moved[0]}")
+        warn(Finding("photos_by_name", str(source), {"count": len(moved), "first": moved[0]}))
     named = zip(view_names(files), files, photos, strict=True)
     views = tuple(View(name, folder / file, photo.lens) for name, file, photo in named)
     cameras = Cameras(
@@ -186,36 +186,39 @@ def check_photos(scene: Scene) -> None:
     present = [path.is_file() for path in paths]
     if not all(present):
         missing = present.index(False)
-        beside = describe_folder(paths[missing].parent)
         if any(present):
+            beside = describe_folder(paths[missing].parent)
             raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside}")
-        if beside:
-            warn(f"{paths[0]}: this photo and all others are missing{beside}")
+        if found := list_photos_in(paths[missing].parent):
+            warn(Finding("all_photos_missing", str(paths[0]), {"found": found}))
         return
     warn_of_turned(paths)
     known = _bits_of_views(scene)
     if 8 < max(known) < 16:
         deep = [path for path, bits in zip(paths, known, strict=True) if bits > 8]
-        message = f"{len(deep)} photos of 16 bits hold numbers of {max(known)} bits at most: they are brightened alike"
-        warn(f"{deep[0]}: {message}")
+        warn(Finding("few_bits", str(deep[0]), {"count": len(deep), "bits": max(known)}))
 
 
 def warn_of_turned(paths: Sequence[Path]) -> None:
     """Warn (InputWarning) of photos that an orientation tag (EXIF's, or TIFF's) asks viewers to turn."""
     turned = [path for path in paths if is_turned(path)]
     if turned:
-        message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
-        warn(f"{turned[0]}: {message}")
+        warn(Finding("turned_for_display", str(turned[0]), {"count": len(turned)}))
 
 
-def describe_folder(folder: Path) -> str:
-    """What is in the folder where a photo is missing, as the end of a sentence; "" if nothing is."""
+def list_photos_in(folder: Path) -> tuple[str, ...]:
+    """Names of the photos in a folder; () where there is none, or no folder."""
     try:
         names = sorted(path.name for path in folder.iterdir() if path.is_file())
     except OSError:
-        return ""
-    pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
-    return f"; found {list_some(pictures)}" if pictures else ""
+        return ()
+    return tuple(name for name in names if name.lower().endswith(PHOTO_SUFFIXES))
+
+
+def describe_folder(folder: Path) -> str:
+    """The photos in the folder where one is missing, as the end of a sentence; "" if there are none."""
+    found = list_photos_in(folder)
+    return f"; found {list_some(found)}" if found else ""
 
 
 def require_photos(scene: Scene, folder: Path) -> None:

@@ -20,6 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from mvseg.errors import InputError, faults_of, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, load_json, read_json
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.opencv_yaml import Calibration, read_calibration
@@ -85,7 +86,7 @@ def warn_of_unknown_keys(path: Path, entries: Iterable[tuple[str, BaseModel]]) -
     """Say (InputWarning) which keys of the named entries of a file are not used."""
     for owner, entry in entries:
         for key in list(entry.model_extra or {})[:MANY]:
-            warn(f"{path}: key '{key}' of {owner} is not known and not used")
+            warn(Finding("unknown_key", str(path), {"key": key, "owner": owner}))
 
 
 def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from mvseg.errors import InputError, check_arguments, collect_warnings, warn
+from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
-from mvseg.formats.find_views import find_file, list_some
+from mvseg.formats.find_views import find_file
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
@@ -64,7 +65,7 @@ def _read_cameras(folder: Path) -> Scene:
     scene = None if is_own else _read_others(folder)
     if scene is not None:
         if rig.is_file():
-            warn(f"{rig}: is not a rig file, and not used; the cameras are those of {scene.source}")
+            warn(Finding("rig_not_used", str(rig), {"source": str(scene.source)}))
         return scene
     if rig.is_file():
         return read_rig(rig)  # also another program's: it says what is missing

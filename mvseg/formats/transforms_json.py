@@ -16,6 +16,7 @@ import pycolmap
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from mvseg.errors import InputError, faults_of, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.json_file import Items, Pixels, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
@@ -88,7 +89,7 @@ def read_transforms(path: Path) -> Scene:
             photos.append(_photo(path.parent, frame, shared | frame.intrinsics, undo=undo))
     num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
     if num_masks:
-        warn(f"{path}: the mask_path of {num_masks} frames is not used: it does not tell leaves apart, as --masks does")
+        warn(Finding("mask_paths_not_used", str(path), {"count": num_masks}))
     return build_scene(path.parent, photos, unit="", source=path)
 
 

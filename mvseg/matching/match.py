@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments, warn
+from mvseg.findings.finding import Finding, list_some
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
@@ -63,8 +64,8 @@ def match_regions(
             contradict each other.
     """
     matching = _match(regions, cameras, config, residual_px=residual_px, links=NO_LINKS if links is None else links)
-    if said := describe_disagreement(matching):
-        warn(said)
+    if (disagreement := find_disagreement(matching)) is not None:
+        warn(disagreement)
     return matching
 
 
@@ -113,7 +114,7 @@ def match_masks(
     Returns:
         The matching; instances of different classes have different ids. Its method is that of the config where it is
         not the same for all classes. Warns as `match_regions` does, but not of views that do not agree: that is left to
-        who knows whether this matching stays, see `describe_disagreement`.
+        who knows whether this matching stays, see `find_disagreement`.
     """
     parts, rows = [], []
     for label in masks.classes.unique().tolist() or [1]:
@@ -187,18 +188,16 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
-        warn("the masks of all views are empty: there are no instances")
+        warn(Finding("no_masks"))
     elif bool((2 * regions.boxes[:, 2:] <= cameras.sizes[regions.view_index]).all()):
-        warn("all masks lie in the upper left quarters of their photos: are they masks of photos of half the size?")
+        warn(Finding("masks_of_half_size"))
     pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
     if pairs:
-        first = "views {} and {} share a camera centre".format(*pairs[0])
-        skipped = "this pair is skipped" if len(pairs) == 1 else f"so do {len(pairs) - 1} more pairs; all are skipped"
-        warn(f"{first}: {skipped}")
+        warn(Finding("centres_shared", "views {} and {}".format(*pairs[0]), {"count": len(pairs)}))
 
 
-def describe_disagreement(matching: Matching, names: Sequence[str] = ()) -> str:
-    """A sentence where the views hardly agree, "" elsewhere, and with fewer than three views.
+def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detected: bool = False) -> Finding | None:
+    """The finding where the views disagree about the masks; None elsewhere, and with fewer than three views.
 
     Something is wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
     where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so).
@@ -206,33 +205,36 @@ def describe_disagreement(matching: Matching, names: Sequence[str] = ()) -> str:
     Args:
         matching: of "nview"; of other methods nothing is said.
         names: of the views; (): their indices.
+        is_detected: a detector found the masks in these photos: none is missing or of another photo for the user to
+            mend.
     """
     report, regions, is_matched = matching.report, matching.masks.regions, matching.instance_ids > 0
     if report.explained is None or report.view_explained is None or regions.num_views < 3 or not len(regions):
-        return ""
-    sure = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
+        return None
+    share = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
     is_capped, odd = report.residual_px == NVIEW.dilations[-1], odd_views(report.view_explained)
-    if sure >= DOUBTS.trusted and not is_capped and not odd:
-        return ""
-    facts = f"{sure:.0%} of the ids are expected to be right"
-    called = [names[view] if names else f"view {view}" for view in range(regions.num_views)]
-    if odd:
-        more = f" and {len(odd) - DOUBTS.named} more" if len(odd) > DOUBTS.named else ""
-        facts += f", least in {', '.join(called[view] for view in odd[:DOUBTS.named])}{more}"
-    if is_capped:
-        facts += f", at a reprojection error of {report.residual_px} pixels or more"
-    question = "does each mask, and each camera, belong to its photo? mvseg check compares them"
+    if share >= DOUBTS.trusted and not is_capped and not odd:
+        return None
+    called = tuple(names) or tuple(f"view {view}" for view in range(regions.num_views))
+    odd_ones = list_some([called[view] for view in odd])
+    if is_detected and share < DOUBTS.trusted:
+        return Finding("detector_unsure", values={"share": share})
+    if is_detected and odd:
+        return Finding("views_odd_detected", odd_ones, views=tuple(odd))
     num_per_view = regions.num_per_view
-    richest, sparse = int(num_per_view.max()), num_per_view <= num_per_view.max() / 2
-    if int(sparse.sum()) > len(sparse) / 2:  # then rays find nothing whatever the poses are
-        most = called[int(num_per_view.argmax())]
-        counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of {most}"
-        question = f"{counts}: are masks missing there?"
-    elif few := [view for view in odd if num_per_view[view] <= num_per_view.median() / 2]:
-        view = few[0]
-        count = f"{num_per_view[view]} against {num_per_view.median()} as a rule"
-        question = f"{called[view]} has few masks ({count}): are some missing, or does one cover several instances?"
-    return f"the views hardly agree ({facts}), and ids may be wrong: {question}"
+    most, sparse = int(num_per_view.max()), num_per_view <= num_per_view.max() / 2
+    if int(sparse.sum()) > len(sparse) / 2 and not is_detected:  # then rays find nothing whatever the poses are
+        counts = {"count": int(sparse.sum()), "total": len(sparse), "most": most, "share": share}
+        return Finding("views_sparse", called[int(num_per_view.argmax())], counts)
+    if few := [view for view in odd if num_per_view[view] <= num_per_view.median() / 2]:
+        counts = {"count": int(num_per_view[few[0]]), "usual": int(num_per_view.median()), "share": share}
+        return Finding("view_sparse", called[few[0]], counts, (few[0],))
+    others = is_matched & ~torch.isin(regions.view_index, torch.tensor(odd).to(regions.view_index))
+    if odd and others.any() and float(matching.match_scores[others].mean()) >= DOUBTS.trusted:  # they agree
+        return Finding("views_odd", odd_ones, {"share": share}, tuple(odd))
+    if share >= DOUBTS.trusted:
+        return Finding("rough_masks", values={"px": NVIEW.dilations[-1]})
+    return Finding("views_disagree", values={"share": share})
 
 
 def odd_views(view_explained: Tensor) -> list[int]:

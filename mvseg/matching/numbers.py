@@ -153,7 +153,6 @@ class DoubtNumbers:
 
     trusted: float = 0.75  # mean match score from which ids are taken for right
     alike: float = 0.7  # what an odd view explains, as a share of what the median view explains, at most
-    named: int = 3  # views that a sentence names
     min_views: int = 4  # limit: views from which one of them can be told to be odd
 
 

@@ -13,15 +13,14 @@ from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
-from mvseg.matching.match import describe_disagreement, match_masks
+from mvseg.matching.match import match_masks
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
 from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
-
-NOTHING_LEFT = "the corrections reject every mask: no leaf is left"
 
 
 def apply_edits(known: Known, corrections: Corrections | None) -> Known:
@@ -43,7 +42,7 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
         matched, seen = _match_anew(known, corrected, seen)
     masks, corrected = apply_everywhere(corrected, matched.masks)
     if len(shown) and not len(masks):
-        warn(NOTHING_LEFT)
+        warn(Finding("no_leaf_left"))
     edited = replace(
         matched, instances=Instances(), left=(), edits=corrected.fates, refused=corrected.refused
     ).with_masks(masks)
@@ -103,9 +102,9 @@ def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Known
     matched = matching.masks.to("cpu")
     seen = leave_joined(seen, matched.instance_ids, is_held)
     ids = torch.where(seen > 0, seen + matched.num_instances, matched.instance_ids)
-    said = describe_disagreement(matching, known.opened.names)
+    disagreement = known.opened.find_disagreement(matching)
     matching = matching.with_masks(replace(matched, instance_ids=ids).close_gaps())
-    return replace(known, matching=matching, disagreement=said), seen
+    return replace(known, matching=matching, disagreement=disagreement), seen
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:

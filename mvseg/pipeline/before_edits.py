@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.known import Known
@@ -27,10 +28,21 @@ from mvseg.verification.choose import LeftOut
 MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
 FIELDS = ("matching", "instances", "proposals", "matched", "left", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
-CLASSES: list[Any] = [Approach, Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality, Regions]
+CLASSES: list[Any] = [
+    Approach,
+    Finding,
+    Instances,
+    LeafSurface,
+    LeftOut,
+    MatchReport,
+    Masks,
+    Matching,
+    Quality,
+    Regions,
+]
 
 
-def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
+def pack_known(known: Known, said: Sequence[Finding]) -> bytes | None:
     """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`). None where it is
     too much to be read again."""
     packed = io.BytesIO()
@@ -49,7 +61,7 @@ def pack_known(known: Known, said: Sequence[str]) -> bytes | None:
     return zlib.compress(packed.getvalue(), 1) if packed.tell() <= MOST_BYTES else None
 
 
-def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | None:
+def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[Finding]] | None:
     """What `pack_known` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
 
     There are no looks: a detector that is to learn looks again. None: it is of other views, or something else.

@@ -15,7 +15,7 @@ from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.find_leaves import Found, Look, find_leaves
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
-from mvseg.matching.match import describe_disagreement
+from mvseg.findings.finding import Finding
 from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
@@ -112,10 +112,10 @@ def _choose(opened: Opened, look: Look, detect: DetectConfig) -> Found:
 
 def know(opened: Opened, found: Found) -> Known:
     """What is known once a look is chosen; warns of what there is to say of it."""
-    for sentence in found.said:
-        warn(sentence)
+    for finding in found.said:
+        warn(finding)
     if not len(found.looks[0].sure):
-        warn(f"the detector finds nothing that scores {opened.config.detect.min_score:g} or more")
+        warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
     matching = Matching(found.matched[0], found.report)
     known = Known(
         opened=opened,
@@ -125,6 +125,6 @@ def know(opened: Opened, found: Found) -> Known:
         matched=found.matched,
         looks=found.looks,
         left=(),
-        disagreement=describe_disagreement(matching, opened.names),
+        disagreement=opened.find_disagreement(matching),
     )
     return known.with_leaves(found.leaves) if opened.is_chosen else known

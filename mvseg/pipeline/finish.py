@@ -1,4 +1,4 @@
-"""From what is known to the result: final masks and ids, shapes, traits, and what there is to say of them."""
+"""From what is known to the result: final masks and ids, shapes, traits, and findings."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from mvseg.checks.check_scene import warn_of_contradictions
-from mvseg.checks.masks import describe_cut
+from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.corrections.settle import settle
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding, Values, keep_causes
 from mvseg.masks import Masks
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.known import Known
@@ -21,30 +21,34 @@ from mvseg.system.running import timed
 if TYPE_CHECKING:
     from mvseg.reconstruction.config import ReconstructConfig
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-    from mvseg.verification.unexplained import Missing
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
 
 
+REFUSED = ("broken_photo", "photo_size", "photo_turned")  # by the first stage that reads the photo
+
+
 def finish(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
-    """The final masks and ids, shapes and traits; and what there is to say of them. For the arguments see
-    `shape_leaves`."""
-    result, config = shape_leaves(known, same_segmenter=same_segmenter), known.opened.config
-    if known.disagreement:
-        warn(known.disagreement)
-    if (missing := _find_missing(known, result)) is not None:
-        warn(f"{missing.why}; what helps: {missing.helps}")
-    result = replace(result, missing=missing, disagreement=known.disagreement)
+    """The final masks and ids, shapes and traits; and the findings, of which it warns (InputWarning). For the arguments
+    see `shape_leaves`."""
+    result, opened = shape_leaves(known, same_segmenter=same_segmenter), known.opened
+    shapes = opened.config.reconstruct
     with timed("check"):
-        has_photos = config.reconstruct is not None and known.opened.photos.exist
-        photos = known.opened.photos if has_photos else None
-        result = replace(result, contradictions=warn_of_contradictions(result.scene, result.regions, photos=photos))
-    if config.reconstruct is None:
-        return result
-    if cut := describe_cut(result.regions.to("cpu"), result.scene.cameras.to("cpu")):
-        warn(cut)
-    return _measure(result, config, config.reconstruct)
+        check = check_scene(
+            result.scene,
+            result.regions,
+            photos=opened.photos,
+            features=shapes is not None and opened.photos.exist,
+            is_detected=opened.given is None,
+        )
+    noticed = *check.findings, known.disagreement, _find_missing(known, result), _find_doubtful(result)
+    findings = keep_causes(each for each in noticed if each is not None and each.code not in REFUSED)
+    for finding in findings:
+        if finding.level != "note":
+            warn(finding)
+    result = replace(result, findings=findings)
+    return result if shapes is None else _measure(result, opened.config, shapes)
 
 
 def shape_leaves(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
@@ -75,8 +79,8 @@ def shape_leaves(known: Known, *, same_segmenter: Mapping[int, LeafSurface] | No
     shown = surfaces or known.instances.starts
     left, fates = settle(known.edits, known.refused, known.left, shown, cameras=known.scene.cameras)
     for fate in fates:
-        if fate.message:
-            warn(fate.message)
+        if fate.finding is not None:
+            warn(fate.finding)
     return Result(
         scene=known.scene,
         matching=known.matching,
@@ -115,14 +119,22 @@ def _fit_surfaces(known: Known, same_segmenter: Mapping[int, LeafSurface] | None
         )
 
 
-def _find_missing(known: Known, result: Result) -> Missing | None:
+def _find_missing(known: Known, result: Result) -> Finding | None:
     """Whether leaves were probably missed, where a detector found them, see `find_missing`."""
     from mvseg.verification.unexplained import find_missing
 
-    if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # a person says that there is none
+    if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # the user says that there is none
         return None
-    may_learn = known.opened.config.learn != "off"
-    return find_missing(result.masks, known.opened.photos, sure_score=DETECTION.sure_score, may_learn=may_learn)
+    return find_missing(result.masks, known.opened.photos, sure_score=DETECTION.sure_score)
+
+
+def _find_doubtful(result: Result) -> Finding | None:
+    surfaces = result.surfaces or {}
+    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good)
+    if not leaves:
+        return None
+    values: Values = {"count": len(leaves), "total": len(surfaces), "leaves": leaves}
+    return Finding("doubtful_shapes", values=values, level="note")
 
 
 def _measure(result: Result, config: RunConfig, shapes: ReconstructConfig) -> Result:

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.corrections.corrected import Fate, Refused
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
-from mvseg.matching.match import describe_disagreement, match_masks
+from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.open_scene import Opened
@@ -43,7 +44,7 @@ class Known:
         edits: what came of a person's edits; () without any.
         refused: pixels where a person says that no leaf is, and where no mask is.
         learned: by the detector from this scene.
-        disagreement: a sentence, where the views hardly agree about the masks, see `describe_disagreement`.
+        disagreement: where the views disagree about the masks, see `find_disagreement`.
     """
 
     opened: Opened
@@ -56,7 +57,7 @@ class Known:
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
     learned: Learned = NOTHING_LEARNED
-    disagreement: str = ""
+    disagreement: Finding | None = None
 
     @property
     def scene(self) -> Scene:
@@ -126,6 +127,6 @@ def match_given(opened: Opened) -> Known:
         matched=(),
         looks=(),
         left=(),
-        disagreement=describe_disagreement(matching, opened.names),
+        disagreement=opened.find_disagreement(matching),
     )
     return known.cut_merged()

@@ -26,6 +26,7 @@ from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
+from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import know, look_near
 from mvseg.pipeline.finish import complete_masks
@@ -73,8 +74,7 @@ def learn(
             photos = known.opened.photos
             labels = label_views(complete_masks(edited), best.proposals, photos, probabilities=chances)
             if not labels.are_enough:
-                few = f"the views agree about {labels.num_leaves} leaves, and it takes {LEAST_LEAVES} to learn from"
-                warn(f"the detector has not learned this plant: {few}; outline some (mvseg correct), or give masks")
+                warn(Finding("learned_too_few", values={"count": labels.num_leaves, "least": LEAST_LEAVES}))
                 break
             if number == 1 and rounds is None:
                 how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
@@ -86,9 +86,9 @@ def learn(
                 break
             best = replace(seen, learned=replace(seen.learned, rounds=number))
     except KeyboardInterrupt:
-        warn(f"learning was interrupted after {len(areas) - 1} rounds: what was found until then stays")
+        warn(Finding("learning_interrupted", values={"count": len(areas) - 1}))
     except InputError as error:
-        warn(f"the detector has not learned this plant: {error}")
+        warn(Finding("learning_failed", values={"reason": str(error)}))
     return replace(best, learned=replace(best.learned, agreed_area=tuple(areas)))
 
 

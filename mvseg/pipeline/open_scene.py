@@ -16,12 +16,14 @@ from mvseg.config import ENOUGH_VIEWS, RunConfig
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.same_scene import named_views
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding, Values
 from mvseg.formats.find_views import natural_order
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.masks import Masks
-from mvseg.matching.match import check_baselines
+from mvseg.matching.match import check_baselines, find_disagreement
+from mvseg.matching.result import Matching
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Scene
@@ -60,6 +62,10 @@ class Opened:
     def names(self) -> list[str]:
         """Of the views."""
         return [view.name for view in self.scene.views]
+
+    def find_disagreement(self, matching: Matching) -> Finding | None:
+        """Where the views disagree about the masks, see `mvseg.matching.match.find_disagreement`."""
+        return find_disagreement(matching, self.names, is_detected=self.given is None)
 
     @property
     def is_checked(self) -> bool:
@@ -112,12 +118,11 @@ def open_scene(
             raise InputError(f"{masks}: has changed while it was read, expected masks that are complete")
         if left_out:
             num_given, regions = len(regions), regions.of_views(taken)
-            message = f"{len(taken)} of {len(whole.views)} views are taken (views is {config.views})"
-            warn(f"{masks}: {num_given - len(regions)} of {num_given} masks are left out: {message}")
+            counts: Values = {"count": num_given - len(regions), "total": num_given, "taken": len(taken)}
+            views: Values = {"num_views": len(whole.views), "views": config.views or 0}
+            warn(Finding("masks_of_other_views", str(masks), {**counts, **views}))
         given = Masks.of(regions)
-        return Opened(
-            scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config, inputs=inputs
-        )
+        return Opened(scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config, inputs=inputs)
 
 
 def _hash_masks(masks: Path) -> str:

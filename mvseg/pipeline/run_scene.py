@@ -15,6 +15,7 @@ from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.errors import check_arguments, collect_warnings, note_warnings
+from mvseg.findings.finding import keep_causes
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import pack_known
 from mvseg.pipeline.finish import finish, shape_leaves
@@ -57,7 +58,7 @@ def run_scene(
         corrections = load_corrections(corrections)
     edits = None if corrections is None else corrections.source
     read = {} if edits is None else {edits: hash_files(edits)}
-    with running() as now, TemporaryDirectory() as place:
+    with note_warnings() as noticed, running() as now, TemporaryDirectory() as place:
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
             check_made_for(corrections, opened.photos)
@@ -79,4 +80,6 @@ def run_scene(
         result = finish(edited, same_segmenter=before)
         packed = pack_known(known, said)
     inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
-    return replace(result, corrections=corrections, before_edits=packed, seconds=now.seconds, inputs=inputs)
+    findings = keep_causes((*noticed, *result.findings))
+    result = replace(result, findings=findings, corrections=corrections, before_edits=packed)
+    return replace(result, seconds=now.seconds, inputs=inputs)

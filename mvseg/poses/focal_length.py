@@ -11,6 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from mvseg.findings.finding import Finding
 from mvseg.poses.cancellable import quiet_colmap
 from mvseg.poses.numbers import TABLE
 
@@ -27,11 +28,12 @@ class FocalLength:
             return f"focal length {self.px:.0f} px, as given"
         return f"focal length {self.px:.0f} +- {self.deviation:.2g} px ({self.deviation / self.px:.1%})"
 
-    def doubts(self, *, mend: str) -> list[str]:
-        """A sentence where the deviation is above `TABLE.sure`, none where it is not; `mend` says what to do."""
+    def doubts(self, code: str, where: str = "") -> list[Finding]:
+        """The finding of this code where the deviation is above `TABLE.sure`, none where it is not."""
         if self.deviation is None or self.deviation <= TABLE.sure * self.px:
             return []
-        return [f"{self.describe()}: lengths above the table are as uncertain; {mend}"]
+        values = {"px": self.px, "deviation": self.deviation, "share": self.deviation / self.px}
+        return [Finding(code, where, values)]
 
 
 def least_sure(lengths: Sequence[FocalLength]) -> FocalLength:
@@ -88,11 +90,9 @@ def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
     return lengths if spread > max(TABLE.sure, TABLE.apart * doubt) else None
 
 
-def say_zooms(lengths: NDArray[np.float64], shared: float) -> str:
-    """The sentence about focal lengths (V,) of photos that one lens of the focal length `shared` was to explain."""
-    ends = f"{lengths.min():.0f} to {lengths.max():.0f} px"
-    what = f"the photos were taken at different zooms (focal lengths from {ends}, and {shared:.0f} px for all)"
-    return f"{what}: cameras and lengths are wrong; --shared_camera false gives each photo a lens of its own"
+def zoom_finding(lengths: NDArray[np.float64], shared: float) -> Finding:
+    """The finding about focal lengths (V,) of photos that one lens of the focal length `shared` was to explain."""
+    return Finding("zooms", values={"low": float(lengths.min()), "high": float(lengths.max()), "shared": shared})
 
 
 def _with_own_lenses(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:

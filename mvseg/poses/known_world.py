@@ -12,8 +12,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError, faults_of, warn
+from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.board import BoardConfig
-from mvseg.formats.find_views import find_views, list_some
+from mvseg.formats.find_views import find_views
 from mvseg.formats.lens import pinhole_from_photo
 from mvseg.formats.markers import Corner, find_board, find_scene_markers, read_grey
 from mvseg.formats.photos import Photos
@@ -110,9 +111,7 @@ def _by_markers(scene: Scene, side: float, unit: str) -> Placement:
     middle = float(np.median(sides))
     odd = int((np.abs(sides / middle - 1) > WORLD.spread).sum())
     if odd:
-        warn(
-            f"{odd} of {len(sides)} markers differ in size by more than {WORLD.spread:.0%}: expected prints of one size"
-        )
+        warn(Finding("markers_differ", values={"odd": odd, "count": len(sides), "share": WORLD.spread}))
     residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
     return Placement(
         similarity=scale_by(side / middle),
@@ -210,7 +209,7 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
         alignment = align(centers, target)
     share = alignment.rms / spreads(target)[0]
     if share > WORLD.misfit:
-        warn(f"{path}: the positions hardly fit the photos (residual {share:.0%} of their spread): do the names match?")
+        warn(Finding("positions_misfit", str(path), {"share": float(share)}))
     return Placement(
         similarity=alignment.similarity,
         unit=unit,
@@ -239,9 +238,8 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     known, found = (_places_on_a_line(points) for points in (target, centers))
     misfit = np.sqrt(max(0.0, 1 - np.corrcoef(known, found)[0, 1] ** 2))
     if misfit > WORLD.misfit:
-        share = f"residual {misfit:.0%} of their spread"
-        warn(f"{path}: the positions hardly fit the photos ({share}): do the names match?")
-    warn(f"{path}: the positions lie on one line, which gives a scale but no axes: the scene keeps its own")
+        warn(Finding("positions_misfit", str(path), {"share": float(misfit)}))
+    warn(Finding("positions_on_a_line", str(path)))
     return Placement(
         similarity=scale_by(float(np.median(ratios))),
         unit=unit,

@@ -13,6 +13,7 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments, warn
+from mvseg.findings.finding import Finding
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.numbers import VOXELS
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
@@ -134,8 +135,7 @@ def reconstruct_instances(
         if grid is not None and grid.occupied.any():
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
-            message = f"instance {instance} has no shape: its {len(members)} masks agree on no point"
-            warn(message)
+            warn(Finding("no_shape", values={"instance": instance, "count": len(members)}))
     return shapes
 
 
@@ -263,6 +263,5 @@ def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, T
         before = volume
     root_low, root_high = silhouettes.cube.box
     if (low - cells.size / 2 < root_low).any() or (high + cells.size / 2 > root_high).any():
-        message = f"the {len(silhouettes)} masks of an instance have no bounded common part (the views are too similar)"
-        warn(f"{message}: its shape is cut off")
+        warn(Finding("shape_cut_off", values={"count": len(silhouettes)}))
     return low, high

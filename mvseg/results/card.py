@@ -1,16 +1,24 @@
-"""What somebody needs to know after a run: what was found, what is in doubt, and the one next step."""
+"""The card of a result: what was found, what is most in doubt, and the one next step, with a command to paste."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from mvseg.findings.finding import Finding
+from mvseg.findings.sentences import UNSURE_IDS
 from mvseg.results.result import Result
 
-NAMED = 3  # views or leaves that a sentence names
+# Findings that a card may name, the gravest first; errors stand after the first two. Views from one side explain more
+# than anything else.
+ONE_SIDED = "no_depth", "one_sided"
+UNTAUGHT = "species_unknown", "detector_unsure", "leaves_missed", "views_odd_detected"
+BY_HAND = "no_leaf_left", "no_leaves"
+SIDES = ("leaves_seen_from_one_side",)
+SHAPES = ("doubtful_shapes",)
 
 
 @dataclass(frozen=True)
@@ -19,20 +27,23 @@ class Card:
 
     Attributes:
         found: how many leaves, in how many photos.
-        doubt: what is probably missing or wrong; "" where nothing is known to be.
-        next_step: what helps most.
+        doubt: the finding that explains most of what is missing or wrong; None where there is none.
+        next_step: what helps most, and the command that does it.
     """
 
     found: str
-    doubt: str
+    doubt: Finding | None
     next_step: str
 
+    def as_json(self) -> dict[str, str]:
+        """The card as run.json holds it."""
+        return {"found": self.found, "doubt": str(self.doubt or ""), "next_step": self.next_step}
 
-def make_card(result: Result, out: Path, *, scene: Path, masks: Path | None = None) -> Card:
-    """The card of the result of a scene, and of its masks where they were given, that is written to `out`."""
-    check = f"mvseg check {scene}" + (f" --masks {masks}" if masks else "")
-    doubt, next_step = _find_doubt(result, out, check)
-    return Card(_say_found(result), doubt, next_step)
+
+def make_card(result: Result, out: Path) -> Card:
+    """The card of a result that is written to `out`."""
+    doubt = _gravest(result)
+    return Card(_say_found(result), doubt, _next_step(result, doubt, shlex.quote(str(out))))
 
 
 def _say_found(result: Result) -> str:
@@ -47,31 +58,31 @@ def _say_found(result: Result) -> str:
     return found
 
 
-def _find_doubt(result: Result, out: Path, check: str) -> tuple[str, str]:
-    """What is most in doubt, and what helps; `check`: the command that compares photos, masks and cameras."""
-    correct = f"mvseg correct {out} asks about what is doubtful"
-    for finding in result.contradictions:
-        if finding.level == "error":
-            views = _name([result.scene.views[view].name for view in finding.views])
-            wrong = f"the cameras of {views} do not fit the others: ids and shapes may be wrong"
-            return wrong if finding.views else finding.what, f"{check} says what to do"
-    if result.missing is not None:
-        return result.missing.why, result.missing.helps
-    if result.disagreement:
-        return result.disagreement, f"{check} says what to do"
-    surfaces = result.surfaces or {}
-    if doubtful := [str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good]:
-        shapes = "the shape of leaf {} is" if len(doubtful) == 1 else "the shapes of leaves {} are"
-        return f"{shapes.format(_name(doubtful))} doubtful: the page says why", correct
-    if surfaces and not result.scene.unit:
-        return "", "lengths are in the unit of the cameras: give --scale and --unit, or film a marker (mvseg target)"
-    return "", correct
+def _gravest(result: Result) -> Finding | None:
+    errors = [each.code for each in result.findings if each.level == "error"]
+    order = (*ONE_SIDED, *errors, *BY_HAND, *UNTAUGHT, *UNSURE_IDS, *SIDES, *SHAPES)
+    candidates = [each for each in result.findings if each.code in order]
+    return min(candidates, key=lambda each: order.index(each.code), default=None)
 
 
-def _name(names: Sequence[str]) -> str:
-    """The first three in a sentence: "a", "a and b", "a, b, c and 2 more"."""
-    shown = [*names[:NAMED], *([f"{len(names) - NAMED} more"] if len(names) > NAMED else [])]
-    return " and ".join(filter(None, (", ".join(shown[:-1]), *shown[-1:])))
+def _next_step(result: Result, doubt: Finding | None, out: str) -> str:
+    if doubt is None and result.surfaces and not result.scene.unit:
+        return "lengths are in the unit of the cameras: give --scale and --unit, or film a marker (mvseg target)"
+    if doubt is None or doubt.code in SHAPES:
+        return f"answer questions about doubtful leaves: mvseg correct {out}"
+    if doubt.code in (*ONE_SIDED, *SIDES):
+        return "film or photograph it from half round, and begin again: mvseg pose PHOTOS --out NEW_SCENE"
+    if doubt.code in UNTAUGHT and not has_tried_to_learn(result):
+        return f"let the views teach the detector this plant: mvseg infer --again {out} --learn 2"
+    if doubt.code in (*UNTAUGHT, *BY_HAND):
+        return f"outline six leaves in two photos each, and let the detector learn them: mvseg correct {out}"
+    return f"compare photos, masks and cameras, view by view: mvseg check {out}"
+
+
+def has_tried_to_learn(result: Result) -> bool:
+    """Whether the detector has tried to learn the plant in this run, or had too few leaves to learn from."""
+    tried = result.learned.rounds > 0 or len(result.learned.agreed_area) > 1
+    return tried or any(each.code in ("learned_too_few", "learning_failed") for each in result.findings)
 
 
 def _say_number(value: float, sd: float) -> str:

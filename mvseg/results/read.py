@@ -22,7 +22,7 @@ from mvseg.corrections.file import parse_corrections
 from mvseg.crop import Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, check_arguments, faults_of, warn
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import Finding, Values
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.label_png import read_label_png, read_labels
@@ -220,8 +220,8 @@ def _with_truth(
     """The regions of the photos that have true labels, and these: files of V `names` in a folder."""
     taken = [view for view, name in enumerate(names) if (truth / name).is_file()] or list(range(len(names)))
     if left_out := [name for view, name in enumerate(names) if view not in taken]:
-        what = f"{len(left_out)} of {len(names)} photos have no true labels ({list_some(left_out)})"
-        warn(f"{truth}: {what}, and are left out")
+        values: Values = {"count": len(left_out), "total": len(names), "names": tuple(left_out)}
+        warn(Finding("no_true_labels", str(truth), values))
         regions = regions.of_views(torch.tensor(taken))
     return regions, [read_label_png(truth / names[view], *sizes[view]) for view in taken]
 
@@ -319,7 +319,8 @@ def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
 
     world, paths = run.traits, (folder / "traits.csv", folder / "traits_wide.csv")
     nodes = _find_file(folder, run, "nodes.csv")
-    return read_traits(*paths, nodes, plant=scene.name, unit=world.unit or "", up=world.up)
+    unit = world.unit or ""
+    return read_traits(*paths, nodes, plant=scene.name, unit=unit, up=world.up, rejected=world.kinds)
 
 
 def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: Traits | None) -> Instances:
@@ -334,9 +335,7 @@ def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: 
         from mvseg.results.shapes_file import read_voxels
 
         voxels = read_voxels(path)
-    return Instances(
-        probabilities=dict(sorted(chances.items())), surfaces=surfaces, voxels=voxels, traits=traits
-    )
+    return Instances(probabilities=dict(sorted(chances.items())), surfaces=surfaces, voxels=voxels, traits=traits)
 
 
 def _find_file(folder: Path, run: RunRecord, name: str) -> Path | None:

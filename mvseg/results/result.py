@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, TypeVar
 
+from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching
@@ -13,7 +14,6 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
-    from mvseg.checks.finding import Finding
     from mvseg.corrections.corrected import Fate
     from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -21,7 +21,6 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.results.run_record import RunRecord
     from mvseg.traits.measure import Traits
     from mvseg.verification.choose import LeftOut
-    from mvseg.verification.unexplained import Missing
 
 T = TypeVar("T")
 
@@ -102,9 +101,7 @@ class Result:
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
         left: candidates that the views did not choose, the most likely leaf first.
-        missing: leaves that the detector probably missed.
-        disagreement: a sentence, where the views hardly agree and ids may be wrong; "" elsewhere.
-        contradictions: what the masks and the photos say against the cameras.
+        findings: what the run noticed of its input and of the result, the gravest first.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
         num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
@@ -123,9 +120,7 @@ class Result:
     instances: Instances = Instances()
     photos: Photos | None = None
     left: tuple[LeftOut, ...] = ()
-    missing: Missing | None = None
-    disagreement: str = ""
-    contradictions: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""
     num_moved: int | None = None

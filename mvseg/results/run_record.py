@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from mvseg._version import __version__
 from mvseg.corrections.corrected import Fate
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
 from mvseg.system.atomic import sweep_abandoned
@@ -34,6 +35,12 @@ class TraitsRecord(_Part):
 
     unit: str | None = None
     up: Vector3 | None = None
+    rejected: dict[str, Any] = {}
+
+    @property
+    def kinds(self) -> dict[int, Any]:
+        """{id of an instance that is no leaf to be measured: kind of the reason}; earlier versions counted kinds."""
+        return {int(leaf): kind for leaf, kind in self.rejected.items() if leaf.isdecimal()}
 
 
 class LearnedRecord(_Part):
@@ -55,7 +62,7 @@ class RunRecord(_Part):
     inputs: dict[str, str] = {}
     config: dict[str, Any] = {}
     mask_kind: str | None = None
-    warnings: tuple[str, ...] = ()
+    findings: tuple[dict[str, Any], ...] = ()
     unit: str | None = None
     up: Vector3 | None = None
     photos: Path | None = None
@@ -71,6 +78,13 @@ class RunRecord(_Part):
     counts: dict[str, int] = {}
     seconds: dict[str, float] = {}
     files: dict[str, str] = {}
+
+    def list_findings(self) -> tuple[Finding, ...]:
+        """The findings of the run; none where another version wrote them in another way."""
+        try:
+            return tuple(Finding.from_json(each) for each in self.findings)
+        except (KeyError, TypeError, AttributeError, ValueError):
+            return ()
 
     def as_json(self) -> dict[str, Any]:
         """What the file holds."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -13,12 +12,12 @@ from typing import Any
 import torch
 
 from mvseg._version import made_by
-from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import collect_warnings, warn
+from mvseg.findings.finding import Finding, keep_causes
 from mvseg.formats.photos import Photos
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.card import Card, make_card
@@ -38,12 +37,10 @@ class Solved:
 
     Attributes:
         result: of the run.
-        messages: the InputWarnings on the way, each once.
         card: the last lines of the run.
     """
 
     result: Result
-    messages: list[str]
     card: Card
 
 
@@ -72,9 +69,9 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if request.config.views else "; --views all takes all"
             say(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", to_stderr=True)
-        for message in solved.messages:
-            if not (is_shown and card.doubt and card.doubt in message):
-                say(f"mvseg: warning: {message}", to_stderr=True)
+        for finding in result.findings:
+            if finding.level != "note" and not (is_shown and finding == card.doubt):
+                say(f"mvseg: warning: {finding}", to_stderr=True)
         with timed("write"):
             save_scene(solved, request, output)
         if finds:
@@ -83,7 +80,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     say(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
     if is_shown:
-        lines = {"found": card.found, "in doubt": card.doubt, "next": card.next_step}
+        lines = {"found": card.found, "in doubt": str(card.doubt or ""), "next": card.next_step}
         lines |= {"look at": str(out / REPORT_FILE)} if request.config.report else {}
         for word, sentence in lines.items():
             if sentence:
@@ -108,9 +105,9 @@ def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfi
 
 def solve_scene(request: RunRequest, *, cache: Path) -> Solved:
     """The result of one scene; warnings that are not of its input are passed on."""
-    with collect_warnings() as messages, TemporaryDirectory() as place:
+    with collect_warnings() as noticed, TemporaryDirectory() as place:
         if request.masks is not None and request.config.detect != DetectConfig():
-            warn("the detect options have no effect: masks are given")
+            warn(Finding("detect_options_unused"))
         result = run_scene(
             request.scene,
             request.masks,
@@ -121,28 +118,22 @@ def solve_scene(request: RunRequest, *, cache: Path) -> Solved:
         )
     if request.learned.weights is not None:
         result = replace(result, learned=request.learned)
-    return Solved(result, messages, make_card(result, request.out, scene=request.scene, masks=request.masks))
+    result = replace(result, findings=keep_causes((*noticed, *result.findings)))
+    return Solved(result, make_card(result, request.out))
 
 
 def save_scene(solved: Solved, request: RunRequest, output: Output) -> None:
-    """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
-    masks. `output`: what may be replaced."""
+    """Write the result folder, run.json included. `output`: what may be replaced."""
     result, config = solved.result, request.config
-    run = describe_run(result, request.masks, config, messages=solved.messages)
-    run["card"] = asdict(solved.card)
+    run = describe_run(result, request.masks, config)
+    run["card"] = solved.card.as_json()
     run["config"] |= record_places(request.scene, request.out, request.masks, request.corrections)
-    if config.report:
-        # of what features say the run has warned
-        check = check_scene(result.scene, result.regions, photos=result.photos, features=False)
-        run["checks"] = [asdict(finding) for finding in check.findings]
     save_result(result, request.out, run, report=config.report, output=output)
 
 
-def describe_run(
-    result: Result, masks: Path | None, config: RunConfig, *, messages: Sequence[str] = ()
-) -> dict[str, Any]:
+def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[str, Any]:
     """Where a result comes from, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
-    detector's weights, too), the options of the stages that ran, and the `messages` of the run."""
+    detector's weights, too), and the options of the stages that ran; and the findings."""
     options = asdict(config)
     if masks is not None:
         del options["detect"], options["learn"]
@@ -158,7 +149,7 @@ def describe_run(
         "inputs": dict(result.inputs),
         "photo_sha256": _hash_photos(result),
         "config": options,
-        "warnings": list(messages),
+        "findings": [each.as_json() for each in result.findings],
     }
 
 

@@ -13,11 +13,11 @@ import pycolmap
 
 from mvseg._version import made_by
 from mvseg.errors import InputError, collect_warnings, warn
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import Known, PoseConfig
-from mvseg.poses.focal_length import FocalLength, find_zooms, focal_lengths, least_sure, say_zooms
+from mvseg.poses.focal_length import FocalLength, find_zooms, focal_lengths, least_sure, zoom_finding
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
@@ -30,8 +30,6 @@ from mvseg.system.running import now_running
 from mvseg.system.say import say
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
-
-MEND = "take photos from more heights, or give the lens (--calibration)"  # of a focal length that is unsure
 
 
 def pose_photos(
@@ -70,25 +68,29 @@ def pose_photos(
         read_positions(known.positions)  # to find mistakes in it before the minutes that follow
     start, run = time.perf_counter(), dict[str, Any](made_by())
     with replace_result(out, run, output) as folder:
-        with collect_warnings() as messages:
+        with collect_warnings() as findings:
             images = folder / IMAGES
             files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, images)
             structure = find_structure(images, files, config=config, calibration=calibration, work=folder)
             lengths = focal_lengths(structure.model, is_given=calibration is not None)
             zooms = None if calibration is not None else find_zooms(structure.model)
             if zooms is not None:
-                warn(say_zooms(zooms, lengths[0].px))
-            for sentence in least_sure(lengths).doubts(mend=MEND):
-                warn(sentence)
+                warn(zoom_finding(zooms, lengths[0].px))
+            for finding in least_sure(lengths).doubts("focal_length_unsure"):
+                warn(finding)
             placement = place(write_structure(structure, folder), known)
             scene = move_structure(structure, placement.similarity, folder)
             scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
             write_cameras(scene, folder)
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
-        run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
-    for message in messages:
-        say(f"mvseg: warning: {message}", to_stderr=True)
+        run |= {
+            "up": scene.up,
+            "findings": [each.as_json() for each in findings],
+            "seconds": round(time.perf_counter() - start, 1),
+        }
+    for finding in findings:
+        say(f"mvseg: warning: {finding}", to_stderr=True)
     if now_running().progress:
         say(summarize_poses(out, structure, placement=placement, scene=scene))
         say(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))

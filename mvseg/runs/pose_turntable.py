@@ -32,7 +32,6 @@ from mvseg.system.say import say
 
 TURNTABLE_FILE = "turntable.json"
 ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
-MEND = "photograph the board tilted by 10 to 30 degrees on the table, or give the lens (--calibration)"
 
 Angles = Path | float | None
 
@@ -86,11 +85,13 @@ def pose_board_photos(
         run |= {"residual_px": round(found.residual_px, 4), "corners": found.num_corners, "photos": len(files)}
         lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in found.cameras.items()}
         run["lenses"] = [{"camera": name, "focal_length": asdict(length)} for name, length in lengths.items()]
-        doubts = [f"{name}: {each}" for name, length in lengths.items() for each in length.doubts(mend=MEND)]
-        run["warnings"] = doubts
+        doubts = [
+            each for name, length in lengths.items() for each in length.doubts("turntable_focal_length_unsure", name)
+        ]
+        run["findings"] = [each.as_json() for each in doubts]
         run["registered"] = [name.removeprefix(f"{IMAGES}/") for name, _, _ in views]
-    for sentence in doubts:
-        warn(sentence)
+    for finding in doubts:
+        warn(finding)
     if now_running().progress:
         share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
         say(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")

@@ -13,16 +13,16 @@ from pydantic import TypeAdapter, ValidationError
 from mvseg._version import __version__, code_hash
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import Finding
 from mvseg.results.earlier import RUN_FILE, path_from
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.system.file_hash import hash_files
 
-# Options of earlier versions: what they were by default, and what to say of a result that was made with another value.
+# Options of earlier versions: what they were by default, and the finding about a result of another value.
 GONE: dict[str, tuple[Any, str]] = {
-    "color_card": (None, "its colours were corrected by a colour card, and will be those of the photos."),
-    "detect.min_views": (2, "it has leaves by another number of photos, and will have those that two or more show."),
-    "refine_poses": (False, "its poses were refined by the masks, and will be those of the scene."),
+    "color_card": (None, "color_card_gone"),
+    "detect.min_views": (2, "min_views_gone"),
+    "refine_poses": (False, "refine_poses_gone"),
 }
 READ = ("scene", "masks", "corrections")
 PLACES = (*READ, "out")  # of run.json's config: what the run read and wrote
@@ -39,8 +39,7 @@ class RecordedRun:
         scene: folder of the scene.
         masks: that were given; None: a detector found them.
         corrections: file of a person's edits; None without any.
-        changes: a sentence for each input that is another one now, for another version of mvseg, and for an option
-            that this version no longer has.
+        changes: inputs that are other ones now, another version of mvseg, and options that this version no longer has.
     """
 
     folder: Path
@@ -49,7 +48,7 @@ class RecordedRun:
     scene: Path
     masks: Path | None
     corrections: Path | None
-    changes: tuple[str, ...]
+    changes: tuple[Finding, ...]
 
 
 def read_recorded(folder: Path) -> RecordedRun:
@@ -94,12 +93,10 @@ def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> s
     return shlex.join(["mvseg", verb, "--again", str(folder), "--corrections", str(corrections)])
 
 
-def _list_changes(folder: Path, said: RunRecord) -> list[str]:
+def _list_changes(folder: Path, said: RunRecord) -> list[Finding]:
     changes = []
     if said.code != code_hash():
-        changes.append(
-            f"mvseg {said.mvseg[:60]} made this result, and this is {__version__}: what it computes may differ."
-        )
+        changes.append(Finding("other_version", values={"before": said.mvseg[:60], "now": __version__}))
     named = [find_place(folder, said, Path(str(said.config[name]))).resolve() for name in READ if said.config.get(name)]
     if isinstance(detect := said.config.get("detect"), dict):
         from mvseg.detectors.zoo import weights_path  # loads torchvision
@@ -109,15 +106,15 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
     for stated, sha256 in said.inputs.items():
         path = find_place(folder, said, Path(stated))
         if not (path.is_dir() or path.is_file()):
-            changes.append(f"{path}: is gone since this result was made.")
+            changes.append(Finding("input_gone", str(path)))
         elif not any(path.resolve().is_relative_to(place) for place in named):
-            changes.append(f"{path}: is not looked at, since the run did not read it.")
+            changes.append(Finding("input_not_read", str(path)))
         elif hash_files(path) != sha256:
-            changes.append(f"{path}: has changed since this result was made.")
+            changes.append(Finding("input_changed", str(path)))
     changes += _list_other_photos(folder, said)
     before = {name: _option(said, name) for name in GONE}
-    changes += [f"{folder}: {what}" for name, (usual, what) in GONE.items() if before[name] not in (None, usual)]
-    return changes
+    gone = [code for name, (usual, code) in GONE.items() if before[name] not in (None, usual)]
+    return changes + [Finding(code, str(folder)) for code in gone]
 
 
 def _option(said: RunRecord, name: str) -> Any:
@@ -127,7 +124,7 @@ def _option(said: RunRecord, name: str) -> Any:
     return inside.get(own) if isinstance(inside, dict) else None
 
 
-def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
+def _list_other_photos(folder: Path, said: RunRecord) -> list[Finding]:
     if said.photos is None:
         return []
     place, count = find_place(folder, said, said.photos), len(said.photo_sha256)
@@ -135,10 +132,9 @@ def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
     others = [
         name for name, sha256 in said.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
     ]
-    facts = {"have changed": others, "are gone": gone}
     return [
-        f"{place}: {len(names)} of {count} photos {what} since this result was made ({list_some(names)})."
-        for what, names in facts.items()
+        Finding(code, str(place), {"count": len(names), "total": count, "names": tuple(names)})
+        for code, names in (("photos_changed", others), ("photos_gone", gone))
         if names
     ]
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import list_some
 from mvseg.results.read import load_learned
 from mvseg.results.result import NOTHING_LEARNED, Learned
 from mvseg.runs.recorded_run import read_recorded

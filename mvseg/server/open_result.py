@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -26,7 +24,8 @@ from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.errors import InputError, InputWarning, collect_warnings
+from mvseg.errors import InputError, collect_warnings
+from mvseg.findings.finding import Finding
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
@@ -80,8 +79,9 @@ class OpenResult:
         self.folder = folder
         self.run = read_recorded(folder)
         self._detector = _read_detector(folder)
-        self._changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
-        self.notice = " ".join(("What you see is computed anew.", *self._changes)) if self._changes else ""
+        self._changes = [each for each in self.run.changes if each.where != str(self.run.corrections)]
+        changes = (as_sentence(each) for each in self._changes)
+        self.notice = " ".join(("What you see is computed anew.", *changes)) if self._changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
         config = self.run.config
         if self._detector is not None:  # it has learned this plant: nobody waits for that again
@@ -94,7 +94,7 @@ class OpenResult:
         self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self._before: tuple[Known, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
-        self.learned: tuple[Known, list[str]] | None = None  # what is known since the detector learned the plant
+        self.learned: tuple[Known, list[Finding]] | None = None  # what is known since the detector learned the plant
 
     @property
     def can_learn(self) -> bool:
@@ -118,10 +118,9 @@ class OpenResult:
     def read_edits(self) -> tuple[Corrections, str]:
         """The edits in the folder, and what a person should know of them."""
         found = self.saved_corrections()
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", InputWarning)
+        with collect_warnings() as noticed:
             check_made_for(found, self.photos)
-        return found, " ".join(filter(None, (self.notice, *(f"{each.message}." for each in caught))))
+        return found, " ".join(filter(None, (self.notice, *map(as_sentence, noticed))))
 
     def mark(self, corrections: Corrections) -> Corrections:
         """The edits with the marks of the photos that they name."""
@@ -176,8 +175,9 @@ class OpenResult:
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
-        and, as sentences, the warnings on the way that the run did not give: those are on the page. Leaves keep their
-        numbers from one result to the next, see `keep_numbers`.
+        and, as sentences, what was noticed on the way that the run did not tell: that is on the page. Codes are
+        compared, as edits change by how many degrees or masks something is so. Leaves keep their numbers from one
+        result to the next, see `keep_numbers`.
 
         The result is that of `mvseg infer --again`, bit for bit: what was fitted before is taken where it would be
         fitted to the same.
@@ -186,15 +186,14 @@ class OpenResult:
             Cancelled: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        known, messages = self._now_known
+        known, noticed = self._now_known
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(known, corrections)
             result = shape_leaves(edited, same_segmenter=self._fit_before(known) if edited.edits else None)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
-        told = {_without_numbers(text) for text in (*self.run.said.warnings, *(fate.message for fate in shown.fates))}
-        new = [text for text in dict.fromkeys(messages + more) if _without_numbers(text) not in told]
-        said = [f"{text[:1].upper()}{text[1:]}." for text in new]
-        return shown, [describe_fate(fate) for fate in shown.fates], said
+        told = {"edit", *(each.get("code") for each in self.run.said.findings)}
+        new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
+        return shown, [describe_fate(fate) for fate in shown.fates], [*new]
 
     def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:
         """Let the detector learn the leaves that the views agree about, and those that a person outlined, in one round;
@@ -214,7 +213,7 @@ class OpenResult:
         with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
             learned = learn(self._seen, cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
         if learned.learned.weights is None:
-            raise InputError(f"{' '.join(said)}.")
+            raise InputError(" ".join(map(as_sentence, said)))
         self.learned = learned, said
 
     def unlearn(self) -> None:
@@ -258,18 +257,18 @@ class OpenResult:
         return {"polygon": np.round(placed, 2).tolist()}
 
     @property
-    def _now_known(self) -> tuple[Known, list[str]]:
+    def _now_known(self) -> tuple[Known, list[Finding]]:
         return self._known if self.learned is None else self.learned
 
     @cached_property
-    def _known(self) -> tuple[Known, list[str]]:
-        """What is known without a person, and the warnings on the way; it stays."""
+    def _known(self) -> tuple[Known, list[Finding]]:
+        """What is known without a person, and the findings on the way; it stays."""
         before = None if (content := self._before_edits()) is None else unpack_known(content, self.opened)
         if before is not None:
             return before
-        with collect_warnings() as messages:
+        with collect_warnings() as noticed:
             known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
-        return known, messages
+        return known, noticed
 
     def _fit_before(self, known: Known) -> Mapping[int, LeafSurface] | None:
         """The surfaces before edits, which tell how the masks err."""
@@ -291,9 +290,10 @@ class OpenResult:
         return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None
 
 
-def _without_numbers(text: str) -> str:
-    """Edits change by how many degrees or masks something is so: a warning that differs in that only is no news."""
-    return re.sub(r"\d+", "", text)
+def as_sentence(finding: Finding) -> str:
+    """The finding as a sentence of a page."""
+    text = str(finding)
+    return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith("?") else ".")
 
 
 def _read_detector(folder: Path) -> bytes | None:

@@ -11,7 +11,7 @@ from typing import Any
 from mvseg.corrections.file import Corrections, dump_edits, load_corrections, name_edits
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import list_some
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
 from mvseg.system.running import Cancelled
 from mvseg.tracking.growth import measure_growth

@@ -141,7 +141,7 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
         return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
 
     for leaf in traits.leaves:
-        if leaf.rejection is None or leaf.rejection.kind == "stem":
+        if leaf.rejection is None or leaf.rejection == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
             seen = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
             leaves.append(replace(seen, is_doubted=leaf.rejection is not None))

@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.evaluation.labelled_photo import LabelledPhoto, label_photo, mask_photo
+from mvseg.findings.finding import Finding
 from mvseg.formats.coco import (
     CocoAnnotation,
     Crowd,
@@ -157,8 +158,8 @@ def _list_coco(photos: Path, found: _Photos, masks: MaskFiles, *, crowd: Crowd) 
         check_corners(annotation.segmentation for annotation in content.annotations)
     num_crowds = sum(bool(annotation.iscrowd) for annotation in content.annotations)
     if num_crowds:
-        what = "taken as masks (coco_crowd ignore ignores their pixels)" if crowd == "mask" else "ignored"
-        warn(f"{labels}: {num_crowds} annotations with iscrowd are {what}")
+        code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
+        warn(Finding(code, str(labels), {"count": num_crowds, "option": "coco_crowd"}))
     class_of = {str(category.id): number for number, category in enumerate(categories, start=1)}
     samples = []
     for image, view in zip(content.images, views, strict=True):
@@ -271,10 +272,9 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
         raise InputError(INTERPOLATED)
     num_boxes, num_covered = sum(each[1] for each in sound), sum(each[2] for each in sound)
     if num_boxes:
-        warn(f"{num_boxes} entries of masks are boxes, lines, points or to be ignored, and are left out")
+        warn(Finding("boxes_left_out", "labels", {"count": num_boxes}))
     if num_covered:
-        what = f"a mask covers more than {COVERS:.0%} of {num_covered} photos"
-        warn(f"{what}: if it is the background, make it 0")
+        warn(Finding("background_masks", values={"share": COVERS, "count": num_covered}))
     return [0 if isinstance(answer, str) else answer[0] for answer in answers], broken
 
 
@@ -304,8 +304,7 @@ def keep_sound(
     every = range(len(samples))
     unlabelled = {index for index in every if not (counts[index] or samples.samples[index].files or index in broken)}
     if unlabelled and not skip_unlabelled:
-        learned = f"{len(unlabelled)} of {len(samples)} {what} photos have no labels (the first is "
-        learned += f"{samples.samples[min(unlabelled)].name}), and are taken for photos without leaves"
-        warn(f"{learned}; --skip_unlabelled true leaves them out")
+        first = samples.samples[min(unlabelled)].name
+        warn(Finding("photos_without_labels", what, {"count": len(unlabelled), "total": len(samples), "first": first}))
     left_out = broken.keys() | (unlabelled if skip_unlabelled else set())
     return samples.select([index for index in every if index not in left_out]), broken

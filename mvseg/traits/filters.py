@@ -29,35 +29,12 @@ FEWEST = 3  # instances, for floor and distance to be told
 NUM_POINTS = 400  # of a shape, for distances
 
 
-# What the reasons of a rejection begin with, or, of those that begin with a number, hold.
-WORDS: dict[Kind, str] = {
-    "few_sure_views": "sure views, asked for are",
-    "low_quality": "median IoU",
-    "hardly_visible": "its masks cover a share",
-    "stem": "looks like a stem",
-    "floor": "looks like the floor",
-    "beside_the_plant": "lies beside the plant",
-}
-
-
 @dataclass(frozen=True)
 class Rejection:
     """Why an instance is not measured: the kind, which is counted, and a sentence."""
 
     kind: Kind
     reason: str
-
-    @staticmethod
-    def of(reason: str) -> Rejection:
-        """The rejection of this reason, as a table has it.
-
-        Raises:
-            ValueError: no rejection has it.
-        """
-        kinds: list[Kind] = [kind for kind, words in WORDS.items() if words in reason]
-        if len(kinds) != 1:
-            raise ValueError(f"nothing is rejected with the reason '{reason}'")
-        return Rejection(kinds[0], reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +91,11 @@ def find_rejected(
         {instance id: why}: the gravest of several reasons, see `Kind`.
     """
     ious = {instance: median_iou(shape) for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
-    share = WORDS["hardly_visible"] + " of {:.2f} of its surface, asked for is {:g}"
+    share = "its masks cover a share of {:.2f} of its surface, asked for is {:g}"
     limits: tuple[tuple[Kind, Mapping[int, float], float, str], ...] = (
         ("hardly_visible", visible_shares, config.min_visible_share, share),
-        ("low_quality", ious, config.min_quality, WORDS["low_quality"] + " {:.2f} with its masks, asked for is {:g}"),
-        ("few_sure_views", sure_views, config.min_sure_views, "{} " + WORDS["few_sure_views"] + " {}"),
+        ("low_quality", ious, config.min_quality, "median IoU {:.2f} with its masks, asked for is {:g}"),
+        ("few_sure_views", sure_views, config.min_sure_views, "{} sure views, asked for are {}"),
     )
     found: dict[int, Rejection] = {}
     for kind, values, least, reason in limits:
@@ -128,7 +105,8 @@ def find_rejected(
         return found
     for instance, chance in stems.items():
         if chance >= SURELY_STEM and instance not in found:
-            found[instance] = Rejection("stem", f"{WORDS['stem']}: a tube explains its masks, probability {chance:.2f}")
+            reason = f"looks like a stem: a tube explains its masks, probability {chance:.2f}"
+            found[instance] = Rejection("stem", reason)
     bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
     rules: list[Callable[[dict[int, _Body]], dict[int, Rejection]]] = [find_distant]
     if up is not None:
@@ -156,7 +134,7 @@ def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
     ratio = bodies[lowest].area / max(max(body.area for body in others), 1e-300)
     if ratio <= FLOOR_AREA:
         return {}
-    reason = f"{WORDS['floor']}: below everything else, and {ratio:.1f} times the largest leaf"
+    reason = f"looks like the floor: below everything else, and {ratio:.1f} times the largest leaf"
     return {lowest: Rejection("floor", reason)}
 
 
@@ -175,6 +153,6 @@ def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
     away, found = gaps[:, plant].min(1) / length, {}
     for instance, steps, is_plant in zip(bodies, away, plant, strict=True):
         if not is_plant:
-            reason = f"{WORDS['beside_the_plant']}: {steps:.1f} lengths of a large leaf away from it"
+            reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
             found[instance] = Rejection("beside_the_plant", reason)
     return found

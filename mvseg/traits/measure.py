@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -17,7 +16,7 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
-from mvseg.traits.filters import Rejection, find_rejected, median_iou
+from mvseg.traits.filters import Kind, Rejection, find_rejected, median_iou
 from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import LEAF_TRAITS
@@ -39,14 +38,14 @@ class LeafTraits:
         numbers: {trait: number} of all `LEAF_TRAITS`.
         method: "surface", "voxels", or "none" for an instance without a shape.
         reasons: to doubt the numbers, or why there are none; empty for a good leaf.
-        rejection: why it does not count as a leaf, None where it does.
+        rejection: kind of the reason why it does not count as a leaf, None where it does.
     """
 
     leaf: int
     numbers: Mapping[str, Measurement]
     method: str
     reasons: tuple[str, ...]
-    rejection: Rejection | None
+    rejection: Kind | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +69,9 @@ class Traits:
     stems: tuple[Stem, ...] = ()
 
     @property
-    def rejected(self) -> dict[str, int]:
-        """{kind of rejection: how many instances}."""
-        return dict(Counter(leaf.rejection.kind for leaf in self.leaves if leaf.rejection is not None))
+    def rejected(self) -> dict[int, Kind]:
+        """{id of an instance that is no leaf to be measured: kind of the reason}."""
+        return {leaf.leaf: leaf.rejection for leaf in self.leaves if leaf.rejection is not None}
 
 
 @check_arguments
@@ -180,4 +179,5 @@ def describe_leaf(
         reasons = (*reasons, f"in {num_parts} pieces")
         found["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
-    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=rejection)
+    kind = None if rejection is None else rejection.kind
+    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=kind)

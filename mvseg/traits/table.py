@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 from mvseg.errors import InputError
 from mvseg.formats.text_file import read_table, write_table
-from mvseg.traits.filters import Rejection
+from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
@@ -24,7 +24,7 @@ NODE_COLUMNS = (
     "phyllotaxis_probability",
 )  # fmt: skip
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
-GOOD, REJECTED = "good", "rejected: "
+GOOD = "good"
 
 
 def write_long(path: Path, traits: Traits) -> None:
@@ -122,9 +122,10 @@ def read_traits(
     plant: str,
     unit: str,
     up: tuple[float, float, float] | None,
+    rejected: Mapping[int, Kind] = MappingProxyType({}),
 ) -> Traits:
     """The traits that `write_long`, `write_wide` and `write_nodes` wrote, with six digits; what the tables do not say
-    is given.
+    is given, as {leaf: kind of its rejection}.
 
     Raises:
         InputError: these are no such tables.
@@ -135,7 +136,7 @@ def read_traits(
             value, sd = float(row["value"] or "nan"), float(row["sd"] or "nan")
             numbers.setdefault(int(row["leaf"] or 0), {})[row["trait"]] = Measurement(value, sd, row["method"])
         leaves = [
-            _read_leaf(int(row["leaf"]), row, numbers[int(row["leaf"])])
+            _read_leaf(int(row["leaf"]), row, numbers[int(row["leaf"])], rejected.get(int(row["leaf"])))
             for row in read_csv(wide, ("leaf", "method", "quality"))
         ]
     except (KeyError, ValueError) as error:
@@ -147,11 +148,10 @@ def read_traits(
     return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up, stems=stems)
 
 
-def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement]) -> LeafTraits:
+def _read_leaf(
+    leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement], rejection: Kind | None
+) -> LeafTraits:
     reasons = () if row["quality"] == GOOD else tuple(row["quality"].split("; "))
-    rejection = None
-    if reasons and reasons[0].startswith(REJECTED):
-        rejection = Rejection.of(reasons[0].removeprefix(REJECTED))
     # The only ones that have no row: where there are no voxels, and in tables of older versions.
     absent = {name: missing("has no voxels") for name in VOXEL_NAMES} | {"node_height": missing("of an older version")}
     return LeafTraits(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.markers import find_scene_markers
 from mvseg.formats.photos import Photos
 from mvseg.reconstruction.triangulate import triangulate_points
@@ -55,13 +56,11 @@ def place_scene(
         scene = replace(scene, cameras=scene.cameras.scale(scale))
     if unit is not None:
         if scene.unit not in ("", unit) and scale is None:
-            message = f"the cameras are in {scene.unit}: unit {unit} without a scale only renames it"
-            warn(message)
+            warn(Finding("unit_only_renamed", values={"before": scene.unit, "unit": unit}))
         scene = replace(scene, unit=unit)
     scene = find_up(scene, up, photos)
     if scene.seems_upside_down:
-        message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
-        warn(message)
+        warn(Finding("upside_down"))
     return scene
 
 

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
@@ -158,8 +159,7 @@ def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
 def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
     parallax = median_parallax(matched, cameras)
     if parallax < ROUGH.least_parallax:
-        message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
-        warn(f"{message}: their surfaces cannot verify their masks")
+        warn(Finding("leaves_seen_from_one_side", values={"degrees": parallax}))
     return parallax >= ROUGH.least_parallax
 
 

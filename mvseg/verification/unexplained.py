@@ -2,23 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from mvseg.findings.finding import Finding
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.verification.leaf_color import has_leaf_color, thin_views
 from mvseg.verification.numbers import COLORS, EVIDENCE
-
-HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct)"
-LEARN = "let the views teach the detector (--learn 2)"
-
-
-@dataclass(frozen=True)
-class Missing:
-    """Leaves that were probably missed: why that is likely, and what helps most."""
-
-    why: str
-    helps: str
 
 
 def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
@@ -42,25 +30,16 @@ def is_familiar(masks: Masks, *, sure_score: float) -> bool:
     return bool(found.any()) and (not len(scores) or float(scores.median()) >= sure_score)
 
 
-def find_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_learn: bool = True) -> Missing | None:
+def find_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> Finding | None:
     """Whether leaves were probably missed.
 
     Args:
         masks, photos: see `share_unexplained`.
         sure_score: detection score of what the detector is sure of.
-        may_learn: whether the detector was allowed to learn the plant (`RunConfig.learn`), and so has tried.
     """
-    found = masks.instance_ids > 0
-    helps = HELP if may_learn else LEARN
-    if not found.any():
-        return Missing("no leaf was found that two photos agree on", helps)
+    if not (masks.instance_ids > 0).any():
+        return Finding("no_leaves")
     if not is_familiar(masks, sure_score=sure_score):
-        return Missing(
-            f"most leaves score less than {sure_score:g}: the detector does not know this species well, and has "
-            "probably missed others",
-            helps,
-        )
+        return Finding("species_unknown", values={"score": sure_score})
     share = share_unexplained(masks, photos)
-    if share > COLORS.unexplained:
-        return Missing(f"{share:.0%} of what has the colour of the leaves that were found is in none", helps)
-    return None
+    return Finding("leaves_missed", values={"share": share}) if share > COLORS.unexplained else None

@@ -29,6 +29,7 @@ from mvseg.cli.options import build_run
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.results.read import read_instances
 from mvseg.system.atomic import lock_folder
 from scene_folders import write_scene
@@ -110,10 +111,12 @@ def test_the_tables_of_a_batch(here: None, plants: Path, tmp_path: Path, capsys:
     assert list(wide[0])[:6] == ["scene", "plant", "time", "pot", "leaf", "area"]  # plant once, as the list has it
     summary = read_table(out / "tables" / "summary.csv")
     columns = ("scene", "plant", "state", "instances", "masks", "views", "warnings", "warning_text")
-    warning = "the cameras are in mm: unit cm without a scale only renames it"
+    warning = str(Finding("unit_only_renamed", values={"before": "mm", "unit": "cm"}))
+    far = summary[1]["warning_text"].partition(" | ")[2]
+    assert far.startswith("2 views (000, 001): the next view is up to 98 degrees away")
     assert [[row[name] for name in columns] for row in summary] == [
         ["plants_basil", "'=b1", "done", "3", "9", "3", "1", warning],
-        ["plants_mint", "m1", "done", "3", "6", "2", "1", warning],
+        ["plants_mint", "m1", "done", "3", "6", "2", "2", f"{warning} | {far}"],
         ["plants_nowhere", "n1", "failed", "0", "0", "0", "0", ""],
     ]
     run = json.loads((out / "tables" / "run.json").read_text())

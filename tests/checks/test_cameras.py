@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvseg.checks.camera_plan import FAULT, INK, POINT, draw_cameras
 from mvseg.checks.cameras import FLIP, camera_findings, field_of_view, find_coverage
-from mvseg.checks.finding import Finding
+from mvseg.findings.finding import Finding
 from mvseg.scene import Cameras, Scene
 from synthetic import arc_positions, cameras_at, moved
 
@@ -78,7 +78,7 @@ def test_absurd_numbers_are_borne(demo_scene: Scene) -> None:
     same = replace(demo_scene.cameras, R=demo_scene.cameras.R[[0] * 6 + [1, 2, 3]],
                    t=demo_scene.cameras.t[[0] * 6 + [1, 2, 3]])  # fmt: skip
     found = findings_of(demo_scene, same)
-    assert [each.views for each in found if "the same position as other" in each.what] == [(0, 1, 2, 3, 4, 5)]
+    assert [each.views for each in found if each.code == "same_position"] == [(0, 1, 2, 3, 4, 5)]
 
 
 def test_another_world_changes_nothing(demo_scene: Scene) -> None:
@@ -104,24 +104,24 @@ def test_the_point_is_where_the_plant_is(demo_scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "level", "views", "words"),
+    ("fault", "level", "views", "code"),
     [
-        (inverted, "error", (), "map camera points to the world: write the inverse"),
-        (flipped, "error", (), "negate rows 2 and 3 of R and t, and 9 of 9 would"),
-        (lambda cameras: inverted(flipped(cameras)), "error", (), "as Blender's do: invert them"),
-        (lambda cameras: turned(cameras, 4, 70), "warning", (4,), "view 4 (004) look past the point"),
-        (lambda cameras: replace(cameras, R=cameras.R[[0] * 9], t=cameras.t[[0] * 9]), "error", (), "all cameras"),
-        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(1000)), "error", (2,), "is t in another unit (mill"),
-        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(20)), "warning", (2,), "is t in another unit?"),
-        (lambda cameras: edited(cameras, 5, lambda K, t: K[:2].mul_(2)), "warning", (5,), "is K that of photos of"),
-        (lambda cameras: edited(cameras, 5, lambda K, t: K[0, 0].mul_(1.5)), "warning", (5,), "a factor of 1.50"),
+        (inverted, "error", (), "inverse_poses"),
+        (flipped, "error", (), "opengl_poses"),
+        (lambda cameras: inverted(flipped(cameras)), "error", (), "inverse_opengl_poses"),
+        (lambda cameras: turned(cameras, 4, 70), "warning", (4,), "look_past"),
+        (lambda cameras: replace(cameras, R=cameras.R[[0] * 9], t=cameras.t[[0] * 9]), "error", (), "same_place"),
+        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(1000)), "error", (2,), "mixed_units"),
+        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(20)), "warning", (2,), "far_out"),
+        (lambda cameras: edited(cameras, 5, lambda K, t: K[:2].mul_(2)), "warning", (5,), "odd_principal_point"),
+        (lambda cameras: edited(cameras, 5, lambda K, t: K[0, 0].mul_(1.5)), "warning", (5,), "odd_focal_lengths"),
     ],
 )  # fmt: skip
-def test_each_fault_has_its_sentence(
-    fault: Fault, level: str, views: tuple[int, ...], words: str, demo_scene: Scene
+def test_each_fault_has_its_code(
+    fault: Fault, level: str, views: tuple[int, ...], code: str, demo_scene: Scene
 ) -> None:
     found = findings_of(demo_scene, fault(demo_scene.cameras))
-    assert (level, views) in [(each.level, each.views) for each in found if words in each.what], found
+    assert (code, level, views) in [(each.code, each.level, each.views) for each in found]
 
 
 def test_cameras_that_look_elsewhere_are_no_fault(demo_scene: Scene) -> None:
@@ -130,7 +130,7 @@ def test_cameras_that_look_elsewhere_are_no_fault(demo_scene: Scene) -> None:
     for view in (1, 4, 7):
         cameras = turned(cameras, view, 60)
     found = findings_of(demo_scene, cameras)
-    assert [(each.level, each.views) for each in found if "look past" in each.what] == [("warning", (1, 4, 7))]
+    assert [(each.level, each.views) for each in found if each.code == "look_past"] == [("warning", (1, 4, 7))]
     assert "error" not in {each.level for each in found}
 
 
@@ -139,7 +139,7 @@ def test_cameras_that_look_elsewhere_are_no_fault(demo_scene: Scene) -> None:
 )
 @pytest.mark.parametrize(
     ("factor", "times", "units"),
-    [(0.001, 1000, "(millimetres and m"), (100, 100, "(centimetres and m"), (0.1, 10, "(millimetres and centim")],
+    [(0.001, 1000, "millimetres and m"), (100, 100, "centimetres and m"), (0.1, 10, "millimetres and centim")],
 )
 def test_cameras_in_two_units(
     views: tuple[int, ...], few: tuple[int, ...], factor: float, times: int, units: str, demo_scene: Scene
@@ -150,10 +150,10 @@ def test_cameras_in_two_units(
         t = cameras.t.clone()
         t[list(views)] *= factor
         (found,) = findings_of(demo_scene, replace(cameras, t=t))
-        length = "short" if (factor < 1) == (views == few) else "long"
-        assert found.views == few
-        assert f"t is some {times} times as {length} as in the other {9 - len(few)}; is t in another unit" in found.what
-        assert units in found.what
+        ratio = 1 / times if (factor < 1) == (views == few) else times
+        assert (found.code, found.views) == ("mixed_units", few)
+        assert (found.values["ratio"], found.values["others"]) == (ratio, 9 - len(few))
+        assert str(found.values["units"]).startswith(units)
         assert found.level == "error" or times == 10
 
 
@@ -169,23 +169,26 @@ def test_a_field_of_view_that_no_lens_has(demo_scene: Scene) -> None:
     cameras = replace(demo_scene.cameras, K=K)
     np.testing.assert_allclose(field_of_view(cameras)[1], np.degrees(2 * np.arctan(400 / 50)))  # photos of 640 x 480
     (found,) = findings_of(demo_scene, cameras)
-    assert found.views == (1,)
-    assert "is K in pixels" in found.what
+    assert (found.code, found.views) == ("odd_field_of_view", (1,))
 
 
 def test_views_from_one_side_only(demo_scene: Scene) -> None:
     cameras = cameras_at(arc_positions(9, span=1.0)[[0, 2, 4, 6, 8, 0, 2, 4, 6]])
     found = findings_of(demo_scene, cameras)
-    assert any("depth is uncertain" in each.what for each in found)
-    (same,) = [each for each in found if "the same position as other" in each.what]
-    assert same.views == (0, 1, 2, 3, 5, 6, 7, 8)
+    assert [(each.code, each.views) for each in found] == [
+        ("same_position", (0, 1, 2, 3, 5, 6, 7, 8)),
+        ("no_depth", ()),
+    ]
+    scene = replace(demo_scene, cameras=cameras_at(arc_positions(17, span=17.0)[::2]))
+    (narrow,) = camera_findings(scene, find_coverage(scene.cameras))
+    assert (narrow.code, narrow.level) == ("one_sided", "warning")
+    assert narrow.values["degrees"] == pytest.approx(17, abs=2)
 
 
 def test_views_too_far_apart(demo_scene: Scene) -> None:
     scene = replace(demo_scene, views=demo_scene.views[:2], cameras=demo_scene.cameras[[0, 4]])
     (found,) = camera_findings(scene, find_coverage(scene.cameras))
-    assert (found.level, found.views) == ("warning", (0, 1))
-    assert "add photos between" in found.what
+    assert (found.code, found.level, found.views) == ("next_view_far", "warning", (0, 1))
 
 
 def test_cameras_that_look_nowhere_together(demo_scene: Scene) -> None:
@@ -195,20 +198,17 @@ def test_cameras_that_look_nowhere_together(demo_scene: Scene) -> None:
         R[view] = R[view] @ rotation([0, 1, 0], 40.0 * view)
         t[view] = -R[view] @ (torch.eye(3).double()[view % 3] * 0.01 * view)
     found = findings_of(demo_scene, replace(demo_scene.cameras, R=R, t=t))
-    assert "error" in {each.level for each in found} or any("no point is seen by more" in each.what for each in found)
+    assert "error" in {each.level for each in found} or "few_look_at_one_point" in [each.code for each in found]
 
 
 def test_what_is_not_known_is_a_note(demo_scene: Scene) -> None:
     found = findings_of(replace(demo_scene, unit="", up=None), demo_scene.cameras)
-    assert [(each.level, each.what.split(":")[0]) for each in found] == [
-        ("note", "the cameras do not say their unit"),
-        ("note", "the cameras do not say which way is up"),
-    ]
+    assert [(each.level, each.code) for each in found] == [("note", "unknown_unit"), ("note", "unknown_up")]
 
 
-def test_an_up_that_the_cameras_contradict_is_a_note(demo_scene: Scene) -> None:
+def test_an_up_that_the_cameras_contradict_is_a_warning(demo_scene: Scene) -> None:
     (found,) = findings_of(replace(demo_scene, up=(0.0, 0.0, -1.0)), demo_scene.cameras)
-    assert (found.level, found.what.split(":")[0]) == ("note", "up may be upside down")
+    assert (found.level, found.code) == ("warning", "upside_down")
 
 
 def test_the_plan_shows_every_camera(demo_scene: Scene) -> None:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mvseg.checks.finding import Finding
 from mvseg.checks.photos import photo_findings, read_photo_facts
+from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, cut_file, edit_rig, write_image, write_scene
@@ -84,7 +84,7 @@ def test_exposures_that_differ_are_noted(tmp_path: Path) -> None:
     expose(folder, 1 / 50, 1 / 60, 1 / 200, 1 / 50)
     (found,) = findings_of(folder)
     assert (found.level, found.views) == ("note", (2,))
-    assert "1.9 stops" in found.what
+    assert found.values["stops"] == pytest.approx(1.9, abs=0.05)
     for times in ([1 / 50, 1 / 60, None, 1 / 50], [1 / 50, None, None, None], [0.0, 1 / 50, 1 / 50, 1 / 50]):
         expose(folder, *times)
         assert findings_of(folder) == []
@@ -95,30 +95,27 @@ def test_sound_photos_have_no_finding(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "level", "views", "words"),
+    ("fault", "level", "views", "code"),
     [
-        (lambda f: write_image(photo(f, 2), np.zeros((48, 64, 3), np.uint8)), "error", (2,), "scale K with the photos"),
-        (lambda f: lay_down(f, 1), "error", (1,), "turn them back"),
-        (lambda f: photo(f, 3).unlink(), "error", (3,), "no photo, the first is"),
-        (lambda f: cut_file(photo(f, 0), 0.5), "error", (0,), "cannot be read"),
-        (lambda f: fill(f, 1, 128), "error", (1,), "show nothing"),
-        (lambda f: [fill(f, view, 0) for view in (0, 1)], "error", (0, 1), "show nothing"),
-        (lambda f: fill(f, 1, 25), "error", (1,), "show nothing"),
-        (lambda f: darken(f, 2), "warning", (2,), "nearly black"),
-        (lambda f: drain(f, 2), "note", (2,), "are grey: leaf colours and greenness are not measured"),
-        (lambda f: dim(f, 2), "warning", (2,), "nearly black"),
-        (lambda f: overexpose(f, 2), "warning", (2,), "overexposed"),
-        (lambda f: turn_by_exif(f, 1), "warning", (1,), "EXIF turns view 1"),
-        (lambda f: shutil.copy(photo(f, 0), photo(f, 3)), "error", (0, 3), "are the same photo"),
+        (lambda f: write_image(photo(f, 2), np.zeros((48, 64, 3), np.uint8)), "error", (2,), "photo_size"),
+        (lambda f: lay_down(f, 1), "error", (1,), "photo_turned"),
+        (lambda f: photo(f, 3).unlink(), "error", (3,), "missing_photos"),
+        (lambda f: cut_file(photo(f, 0), 0.5), "error", (0,), "broken_photo"),
+        (lambda f: fill(f, 1, 128), "error", (1,), "blank_photo"),
+        (lambda f: [fill(f, view, 0) for view in (0, 1)], "error", (0, 1), "blank_photo"),
+        (lambda f: fill(f, 1, 25), "error", (1,), "blank_photo"),
+        (lambda f: darken(f, 2), "warning", (2,), "dark_photo"),
+        (lambda f: drain(f, 2), "note", (2,), "grey_photo"),
+        (lambda f: dim(f, 2), "warning", (2,), "dark_photo"),
+        (lambda f: overexpose(f, 2), "warning", (2,), "overexposed_photo"),
+        (lambda f: turn_by_exif(f, 1), "warning", (1,), "turned_for_display"),
+        (lambda f: shutil.copy(photo(f, 0), photo(f, 3)), "error", (0, 3), "same_photo"),
     ],
 )  # fmt: skip
-def test_each_fault_has_its_sentence(
-    fault: Fault, level: str, views: tuple[int, ...], words: str, tmp_path: Path
-) -> None:
+def test_each_fault_has_its_code(fault: Fault, level: str, views: tuple[int, ...], code: str, tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     fault(folder)
-    found = [each for each in findings_of(folder) if words in each.what]
-    assert [(each.level, each.views) for each in found] == [(level, views)]
+    assert (code, level, views) in [(each.code, each.level, each.views) for each in findings_of(folder)]
 
 
 def test_a_dark_photo_of_12_bits_is_dark_beside_its_neighbours(tmp_path: Path) -> None:
@@ -126,7 +123,7 @@ def test_a_dark_photo_of_12_bits_is_dark_beside_its_neighbours(tmp_path: Path) -
     ramp = np.linspace(0, 4095, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH, 1) * [1, 0.8, 0.6]
     for view in range(4):
         write_image(photo(folder, view), (ramp / (12 if view == 2 else 1 + view)).astype(np.uint16))
-    assert [(each.views, "nearly black" in each.what) for each in findings_of(folder)] == [((2,), True)]
+    assert [(each.views, each.code) for each in findings_of(folder)] == [((2,), "dark_photo")]
 
 
 def test_without_photos_masks_will_do(tmp_path: Path) -> None:
@@ -135,4 +132,4 @@ def test_without_photos_masks_will_do(tmp_path: Path) -> None:
     assert [each.level for each in findings_of(folder)] == ["error"]
     (folder / "images").mkdir()
     (folder / "images" / "plant.heic").touch()
-    assert "give --masks; found plant.heic" in findings_of(folder)[0].what
+    assert findings_of(folder)[0].values["found"] == ("plant.heic",)

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from benchmarks.faults import Faults, degrade_labels
-from mvseg.checks.finding import Finding
 from mvseg.checks.poses import _chosen_pairs, pairwise_agreement, pose_findings, view_agreement
 from mvseg.errors import InputWarning
+from mvseg.findings.finding import Finding
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
@@ -73,13 +73,12 @@ def test_wrong_cameras_are_named(
 ) -> None:
     found = findings_of(demo_regions, fault(demo_scene.cameras))
     assert [(each.level, each.views) for each in found] == [("error", (view,)) for view in views]
-    assert all("agrees with none of the others" in each.what for each in found)
+    assert {each.code for each in found} == {"view_off"}
 
 
 def test_all_cameras_of_the_previous_photo(demo_scene: Scene, demo_regions: Regions) -> None:
     (found,) = findings_of(demo_regions, demo_scene.cameras[[8, *range(8)]])
-    assert (found.level, found.views) == ("error", ())
-    assert "masks and poses of most views disagree" in found.what
+    assert (found.code, found.level, found.views) == ("poses_disagree", "error", ())
 
 
 def test_masks_of_another_view_are_named(demo_scene: Scene, demo_regions: Regions) -> None:
@@ -96,8 +95,7 @@ def test_a_small_turn_is_measured(demo_scene: Scene, demo_regions: Regions) -> N
     assert agreement.offset_px[4] >= 2
     assert np.delete(agreement.offset_px, 4).tolist() == [0.0] * 8
     (found,) = findings_of(demo_regions, turned(demo_scene.cameras, 4, 1))
-    assert (found.level, found.views) == ("warning", (4,))
-    assert "adjust the poses" in found.what
+    assert (found.code, found.level, found.views) == ("lines_miss", "warning", (4,))
 
 
 def test_the_offset_is_how_far_the_lines_miss() -> None:

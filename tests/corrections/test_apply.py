@@ -14,6 +14,7 @@ from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.corrections.settle import settle
+from mvseg.findings.finding import Finding
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.regions import regions_from_label_maps
@@ -40,6 +41,11 @@ MASKS = Masks.of(regions_from_label_maps(MAPS), detection_scores=torch.full((4,)
 
 def correct(*edits: dict[str, Any], masks: Masks = MASKS, scene: Scene = SCENE) -> Corrected:
     return apply(parse_corrections({"format": FORMAT, "edits": list(edits)}), masks, scene)
+
+
+def findings_of(corrected: Corrected) -> list[Finding]:
+    """Of the edits that were not applied, or are odd."""
+    return [each.finding for each in corrected.fates if each.finding is not None]
 
 
 def fates(corrected: Corrected) -> list[str]:
@@ -87,7 +93,8 @@ def test_a_point_belongs_to_the_pixel_that_it_lies_in() -> None:
     assert fates(correct(at("reject", 19.99, 10.0))) == ["applied"]
     corrected = correct(at("reject", 20.0, 10.0), at("reject", 1, 1), at("reject", 12, 12, view="c"))
     assert fates(corrected) == ["points at nothing"] * 3
-    assert corrected.messages[0] == "correction 1 (reject): points at nothing: there is no mask at (20, 10) in view a"
+    why = "points at nothing: there is no mask at (20, 10) in view a"
+    assert str(findings_of(corrected)[0]) == f"correction 1 (reject): {why}"
     assert len(corrected.masks) == 4
 
 
@@ -139,12 +146,12 @@ def test_a_later_edit_wins_and_the_earlier_one_says_so() -> None:
 def test_pieces_that_do_not_touch_are_named() -> None:
     corrected = correct(link("same", ("a", 15, 15), ("a", 35, 15)))
     said = "applied: a contradiction: its masks in view a do not touch"
-    assert corrected.messages == [f"correction 1 (same): {said}"]
+    assert findings_of(corrected) == [Finding("edit", values={"edit": 1, "op": "same", "why": said})]
     chain = correct(link("same", ("a", 15, 15), ("b", 15, 15)), link("same", ("b", 15, 15), ("a", 35, 15)))
-    assert chain.messages == [f"correction 2 (same): {said}"]
+    assert findings_of(chain) == [Finding("edit", values={"edit": 2, "op": "same", "why": said})]
     bridged = [square(20, 10, 30, 20), link("same", ("a", 15, 15), ("a", 35, 15), ("a", 25, 15))]
-    assert correct(*bridged).messages == []
-    assert correct(square(20, 10, 28, 20), link("same", ("a", 15, 15), ("a", 25, 15))).messages == []
+    assert findings_of(correct(*bridged)) == []
+    assert findings_of(correct(square(20, 10, 28, 20), link("same", ("a", 15, 15), ("a", 25, 15)))) == []
 
 
 def test_whole_instances_once_they_are_known() -> None:
@@ -249,8 +256,8 @@ def test_an_outline_is_a_leaf_of_its_own_unless_links_say_otherwise() -> None:
 def test_an_outline_over_everything_says_what_it_replaces() -> None:
     squares = [(5 * n, 10, 5 * n + 4, 20) for n in range(8)]
     masks = Masks.of(regions_from_label_maps([label_map(*squares), label_map()]))
-    said = correct(square(0, 0, 60, 40), masks=masks).messages
-    assert said == ["correction 1 (outline): applied: it replaces 8 masks"]
+    said = findings_of(correct(square(0, 0, 60, 40), masks=masks))
+    assert [str(each) for each in said] == ["correction 1 (outline): applied: it replaces 8 masks"]
 
 
 def test_saying_no_where_no_mask_is_answers_a_question() -> None:
@@ -266,7 +273,7 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
     answered = replace(corrected, fates=final)
     assert left == (other,)
     assert fates(answered) == ["applied", "points at nothing", "applied"]
-    assert len(answered.messages) == 1
+    assert len(findings_of(answered)) == 1
     assert settle(final, answered.refused, left, {}, cameras=SCENE.cameras)[0] == (other,)
 
 

@@ -16,6 +16,7 @@ from blade_scene import as_regions
 from found_masks import FoundMasks, open_photos, see_masks
 from mvseg.corrections.corrected import APPLIED
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Reject
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
@@ -145,7 +146,7 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
     assert after.masks.match_scores[named].tolist() == [1, 1, 1]
     certain = {leaf for leaf, chance in after.instances.probabilities.items() if chance == 1}
     assert certain == set(after.masks.instance_ids[named].tolist())
-    odd = replace(find_in_photos(open_photos(SCENE)), disagreement="the views hardly agree")
+    odd = replace(find_in_photos(open_photos(SCENE)), disagreement=Finding("detector_unsure", values={"share": 0.5}))
     assert apply_edits(odd, Corrections(said)).disagreement == odd.disagreement
     less, alone = (run(*more, Reject(view="v4", at=at(1, 4))) for more in (said, ()))
     assert less.instances.starts.keys() == alone.instances.starts.keys() == before.instances.starts.keys()

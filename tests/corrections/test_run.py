@@ -14,7 +14,7 @@ import torch
 
 from blade_scene import as_regions
 from leafy_scene import write_leafy_scene
-from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
+from mvseg import Corrections, InputError, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, load_corrections, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
@@ -31,6 +31,7 @@ from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
 from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
+from warned import warns_of
 
 IDS_ONLY = RunConfig(reconstruct=None)
 SQUARE = np.array([[-9.0, -9], [-9, 9], [9, 9], [9, -9]])
@@ -122,7 +123,7 @@ def test_the_command_writes_what_came_of_each_edit(
     assert [each["fate"] for each in run["corrections"]] == ["applied", "points at nothing"]
     assert str(path) in run["inputs"]
     sentence = "correction 2 (reject): points at nothing: there is no mask at (127, 1) in view 000"
-    assert sentence in run["warnings"]
+    assert sentence in [each["sentence"] for each in run["findings"] if each["code"] == "edit"]
     assert sentence in capsys.readouterr().err
     annotations = json.loads((out / "plant" / "instances.json").read_text())["annotations"]
     assert [each["corrected"] for each in annotations if "corrected" in each] == ["outline"]
@@ -179,7 +180,7 @@ def test_surfaces_do_not_move_a_corrected_mask(origin: Origin) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:the views hardly agree")  # most photos have no mask of the leaf yet
+@pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")  # most photos have no mask of the leaf yet
 def test_two_outlines_of_one_leaf_show_it_in_all_views(tmp_path: Path) -> None:
     (tmp_path / "plant").mkdir()
     leafy = write_leafy_scene(tmp_path / "plant", num_leaves=2, num_views=5, size=160, span_deg=180)
@@ -214,5 +215,5 @@ def test_two_outlines_of_one_leaf_show_it_in_all_views(tmp_path: Path) -> None:
 
 def test_an_edit_that_points_at_nothing_is_warned_of(plant: Path) -> None:
     said = corrections({"op": "confirm", "view": "none", "at": [1, 1]})
-    with pytest.warns(InputWarning, match=r"correction 1 \(confirm\): points at nothing: there is no view 'none'"):
+    with warns_of("edit"):
         run_scene(plant, plant / "masks", IDS_ONLY, corrections=said)

@@ -11,11 +11,12 @@ import pytest
 from mvseg.cli import main
 from mvseg.corrections.file import Confirm, Corrections, load_corrections, write_corrections
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.image_file import write_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, write_scene
+from warned import warns_of
 
 
 def corrections_of(folder: Path) -> Corrections:
@@ -60,7 +61,7 @@ def test_a_run_stops_unless_it_is_forced(tmp_path: Path, capsys: pytest.CaptureF
 def test_a_file_that_does_not_say_is_taken_with_a_warning(tmp_path: Path) -> None:
     scene = load_scene(write_scene(tmp_path / "balls"))
     old = Corrections((Confirm(view="001", at=(1.0, 1.0)),), source=Path("old.json"))
-    with pytest.warns(InputWarning, match="old.json: does not say which photos it was made for"):
+    with warns_of("edits_of_unknown_photos"):
         check_made_for(old, Photos(scene))
     check_made_for(replace(old, source=None), Photos(scene))
     check_made_for(Corrections(source=Path("empty.json")), Photos(scene))

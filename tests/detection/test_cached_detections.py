@@ -20,10 +20,11 @@ from mvseg.detection.cached_detections import (
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.numbers import DETECTION
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_image, write_scene
+from warned import warns_of
 
 FOUND = {
     "boxes": torch.rand(3, 4),
@@ -129,7 +130,7 @@ def test_a_detector_that_proposes_masks_everywhere_is_bounded_and_said(
     everything = detect_scene(Photos(scene), config).proposals(scene.cameras)
     assert everything.regions.num_per_view.min() > 2
     monkeypatch.setattr("mvseg.detection.detect_scene.DETECTION", replace(DETECTION, most_proposals=2))
-    with pytest.warns(InputWarning, match=r"proposes very many masks in 2 photos \(the best 2 are taken\)"):
+    with warns_of("very_many_proposals"):
         best = detect_scene(Photos(scene), config).proposals(scene.cameras)
     assert best.regions.num_per_view.tolist() == [2, 2]
     for view in range(2):

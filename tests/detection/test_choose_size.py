@@ -19,10 +19,12 @@ from mvseg.detection.config import DetectConfig
 from mvseg.detection.find_leaves import find_leaves
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.verification.leaf_scores import rate_pass
+from warned import warns_of
 
 
 def squares(views: int, *, side: int = 20, score: float = 0.9) -> Masks:
@@ -118,14 +120,14 @@ def test_looks_that_are_thrown_away_are_not_spoken_of(monkeypatch: pytest.Monkey
 
     def detect(_: object, config: DetectConfig, **__: object) -> Any:
         asked.append(config.image_size)
-        warn(f"at {config.image_size}")
+        warn(Finding("dark_photo", f"at {config.image_size}"))
         return look_of(squares(9), longest=64)
 
     monkeypatch.setattr("mvseg.pipeline.find_in_photos.detect_scene", detect)
-    with pytest.warns(UserWarning, match=f"at {size}") as caught:
+    with warns_of("dark_photo") as noticed:
         find_in_photos(open_photos(load_scene(demo_scene()), RunConfig(detect=DetectConfig(image_size=size))))
     assert asked == ([300] if size else [None, 45])
-    assert not [each for each in caught if "at 45" in str(each.message)]
+    assert [each.where for each in noticed if each.code == "dark_photo"] == [f"at {size}"]
 
 
 @pytest.mark.parametrize("is_cropped", [False, True])

@@ -23,7 +23,7 @@ from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError
 from mvseg.formats.photos import load_photos
 from mvseg.masks import Masks, Origin
-from mvseg.matching.match import describe_disagreement
+from mvseg.matching.match import find_disagreement
 from mvseg.matching.result import Matching
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
@@ -31,7 +31,7 @@ from simulated_proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
 
 # what an untrained detector finds in noise does not agree across views
-pytestmark = pytest.mark.filterwarnings("ignore:the views hardly agree")
+pytestmark = pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 
 
 class TinyBackbone(torch.nn.Sequential):
@@ -286,7 +286,9 @@ def test_what_stays_says_that_views_disagree_and_no_earlier_matching_warns() -> 
     cameras = Cameras(K=scene.cameras.K, R=scene.cameras.R[order], t=scene.cameras.t[order], sizes=scene.cameras.sizes)
     matching = match_proposals(proposals, cameras, num_iterations=2)
     names = ["a", "b", "c", "d", "e"]
-    assert describe_disagreement(matching, names).startswith("the views hardly agree")
+    disagreement = find_disagreement(matching, names, is_detected=True)
+    assert disagreement is not None
+    assert disagreement.code == "detector_unsure"
 
 
 def test_classes_are_matched_apart_and_their_matchings_joined() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import tracemalloc
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,14 @@ import torch
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.formats.coco import read_coco, write_coco
 from mvseg.formats.masks.view_regions import stack_views
 from mvseg.formats.run_lengths import decode_rle, encode_mask
 from mvseg.formats.scene_folder import load_masks
 from mvseg.scene import Cameras, Scene, View
+from warned import warns_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
 WIDTH, HEIGHT = 60, 40
@@ -150,9 +151,9 @@ def test_crowds_are_masks_unless_told_otherwise(scene: Scene, tmp_path: Path) ->
     """supervision and datumaro mark masks with holes, or all of them, as crowds."""
     annotations = [{"segmentation": encode_mask(random_mask(seed)), "iscrowd": seed % 2} for seed in range(3)]
     path = write(tmp_path, annotations)
-    with pytest.warns(InputWarning, match="1 annotations with iscrowd are taken as masks"):
+    with warns_of("crowds_taken"):
         assert [number for number, _ in read_all(path, scene)[0]] == [1, 2, 3]
-    with pytest.warns(InputWarning, match="1 annotations with iscrowd are left out"):
+    with warns_of("crowds_ignored"):
         assert [number for number, _ in read_all(path, scene, crowd="ignore")[0]] == [1, 3]
 
 
@@ -244,8 +245,7 @@ def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_pa
 
 
 def test_views_that_the_file_does_not_list_are_empty_and_named(scene: Scene, tmp_path: Path) -> None:
-    message = r"1 views have no entry among the images and no masks, the first is view 1 \(b\); the file holds a.jpg, c"
-    with pytest.warns(InputWarning, match=message):
+    with warns_of("images_missing"):
         masks = read_all(write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "c.jpg")), scene)
     assert [len(view) for view in masks] == [1, 0]
 
@@ -263,7 +263,7 @@ def test_names_of_other_machines_fit_by_their_base_name(form: str, scene: Scene,
     if form == "{}.PNG":  # the suffix alone says nothing
         assert [len(view) for view in read_all(path, scene)] == [1, 0]
         return
-    with pytest.warns(InputWarning, match="2 names fit a photo by the base name only, the first is .* for a$"):
+    with warns_of("base_names"):
         assert [len(view) for view in read_all(path, scene)] == [1, 0]
 
 
@@ -277,7 +277,7 @@ def test_base_names_that_are_not_unique(scene: Scene, tmp_path: Path) -> None:
 def test_boxes_without_masks_are_counted(scene: Scene, tmp_path: Path) -> None:
     box = {"bbox": [1, 2, 3, 4]}
     annotations = [box, {"segmentation": [POLYGON]}, box | {"segmentation": []}, box | {"segmentation": [[]]}]
-    with pytest.warns(InputWarning, match=r"3 annotations have no mask \(a box at most\) and are left out"):
+    with warns_of("annotations_without_mask"):
         assert [number for number, _ in read_all(write(tmp_path, annotations), scene)[0]] == [2]
 
 
@@ -303,7 +303,7 @@ def test_ids_may_be_text_or_missing(scene: Scene, tmp_path: Path) -> None:
 def test_lists_of_results(tmp_path: Path) -> None:
     scene = make_scene("images/000.jpg", "images/017.jpg")
     rles = [encode_mask(random_mask(seed)) for seed in range(2)]
-    path, guess = tmp_path / "results.json", r"results.json: image ids are taken for the numbers of photos \(17: 017\)"
+    path = tmp_path / "results.json"
 
     def write_results(*ids: int | str) -> None:
         pairs = zip(ids, rles, strict=True)
@@ -311,7 +311,7 @@ def test_lists_of_results(tmp_path: Path) -> None:
 
     for ids in ((17, 0), ("017", "000"), ("017.jpg", "000.jpg")):
         write_results(*ids)
-        with pytest.warns(InputWarning, match=guess) if ids[0] == 17 else nullcontext():
+        with warns_of(*(["ids_taken_for_numbers"] if ids[0] == 17 else [])):
             first, second = read_all(path, scene)
         assert [number for number, _ in [*first, *second]] == [2, 1]
         np.testing.assert_array_equal(second[0][1], random_mask(0))
@@ -331,11 +331,10 @@ def test_lists_of_results(tmp_path: Path) -> None:
 
 def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": each} for each in ([POLYGON], [OTHER], [POLYGON])])
-    with pytest.warns(InputWarning) as said:
+    with warns_of("masks_in_one_view") as noticed:
         regions = load_masks(scene, path)
     assert regions.labels.tolist() == [1, 2]
-    assert "1 of 3 masks stand twice, pixel for pixel in one photo, and are taken once" in str(said[0].message)
-    assert "only one view has masks, so that there is nothing to match" in str(said[1].message)
+    assert Finding("masks_twice", str(path), {"count": 1, "total": 3}) in noticed
     write(tmp_path, [{"segmentation": [POLYGON], "image_id": each} for each in (10, 12)], ("a.jpg", "b.jpg", "a.jpg"))
     with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are of one photo, and both have annot"):
         read_all(path, scene)
@@ -344,17 +343,17 @@ def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
 def test_what_nearly_stands_twice_and_what_stands_in_each_other(scene: Scene, tmp_path: Path) -> None:
     moved = [[x + 0.4 for x in POLYGON]]
     path = write(tmp_path, [{"segmentation": each} for each in ([POLYGON], [OTHER], moved)])
-    with pytest.warns(InputWarning) as said:
+    with warns_of("copies") as noticed:
         regions = load_masks(scene, path)
     assert regions.labels.tolist() == [1, 2]
-    assert "1 of 3 masks are nearly another mask of their photo" in str(said[0].message)
-    assert not any("lie inside" in str(each.message) for each in said)
+    assert "masks_inside_masks" not in [each.code for each in noticed]
     part = [10.0, 10.0, 14.0, 10.0, 14.0, 14.0]
     whole = [1.0, 1.0, 40.0, 1.0, 40.0, 39.0, 1.0, 39.0]
     path = write(tmp_path, [{"segmentation": [each]} for each in (whole, part)])
-    with pytest.warns(InputWarning) as said:
+    with warns_of("masks_inside_masks") as noticed:
         assert load_masks(scene, path).labels.tolist() == [1, 2]
-    assert any("1 of 2 masks lie inside of other masks, in view 0" in str(each.message) for each in said)
+    (inside,) = [each for each in noticed if each.code == "masks_inside_masks"]
+    assert (inside.views, inside.values["count"]) == ((0,), 1)
 
 
 def test_masks_that_read_as_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
@@ -375,11 +374,11 @@ def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:
     content = json.loads(path.read_text())
     content["categories"] = [{"id": 1, "name": "leaf"}, {"id": 2, "name": "pot"}, {"id": 3, "name": "stem"}]
     path.write_text(json.dumps(content))
-    with pytest.warns(InputWarning, match=r"masks of 3 categories are taken alike \(2 leaf, 1 pot, 1 9\); --"):
+    with warns_of("several_categories"):
         assert len(read_all(path, scene)[0]) == 4
     for wanted, numbers in ((["leaf"], [1, 3]), (["pot", "9"], [2, 4])):
         assert [number for number, _ in read_all(path, scene, categories=wanted)[0]] == numbers
-    with pytest.warns(InputWarning, match=r"none of the masks is of the category stem, but 2 leaf, 1 pot, 1 9$"):
+    with warns_of("no_mask_of_category"):
         assert read_all(path, scene, categories=["stem"]) == [[], []]
     with pytest.raises(InputError, match=r"there is no category 'leaves', expected of these: leaf, pot, stem, 9"):
         read_all(path, scene, categories=["leaves"])
@@ -434,6 +433,6 @@ def test_written_file_reads_back_here_and_in_pycocotools(
 def test_annotations_of_no_image_are_counted(scene: Scene, tmp_path: Path) -> None:
     segmentation = uncompressed(random_mask(0))
     path = write(tmp_path, [{"segmentation": segmentation}, {"segmentation": segmentation, "image_id": 99}])
-    with pytest.warns(InputWarning, match="1 annotations refer to no image in the file, the first is annotation 2"):
+    with warns_of("orphans"):
         masks = read_all(path, scene)
     assert [len(view) for view in masks] == [1, 0]

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.find_views import base_name, find_views, list_some
+from mvseg.errors import InputError
+from mvseg.findings.finding import list_some
+from mvseg.formats.find_views import base_name, find_views
 from mvseg.scene import Cameras, Scene, View
+from warned import warns_of
 
 
 def scene_of(*files: str) -> Scene:
@@ -64,7 +66,7 @@ def test_names_that_fit_several_views() -> None:
 
 def test_only_loose_names_are_said() -> None:
     scene, names = scene_of("images/1.jpg", "images/2.jpg"), ["1.jpg", "old/2.jpg"]
-    with pytest.warns(InputWarning, match=r"masks: 1 names .* by the base name only, the first is old/2.jpg for 2"):
+    with warns_of("base_names"):
         find_views(names, scene, source=Path("masks"), warn_of_loose=True)
     find_views(names[:1], scene, source=Path("masks"), warn_of_loose=True)
 

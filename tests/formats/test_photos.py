@@ -14,7 +14,7 @@ import tifffile
 import torch
 from PIL import Image
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats import photos as photos_module
 from mvseg.formats.image_file import read_image_size, read_rgb
 from mvseg.formats.photo_content import measure_content
@@ -23,6 +23,7 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, write_image, write_scene
+from warned import warns_of
 
 
 def make_photo(file: str, view: int = 0, **changes: object) -> Photo:
@@ -232,7 +233,7 @@ def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(
     if orientation == 1:
         check_photos(scene)  # warnings are errors
     else:
-        with pytest.warns(InputWarning, match=rf"000\.{suffix}: EXIF turns 1 photos for display"):
+        with warns_of("turned_for_display"):
             check_photos(scene)
     assert np.abs(read_photo(scene, 0).astype(int) - pixels).mean() < 5
 
@@ -266,7 +267,7 @@ def test_a_missing_photo_says_what_is_there(tmp_path: Path) -> None:
         check_photos(scene)
     for number in (0, 2, 3):
         (folder / "images" / f"{number:03d}.png").unlink()
-    with pytest.warns(InputWarning, match=r"000.png: this photo and all others are missing; found plant.png"):
+    with warns_of("all_photos_missing"):
         check_photos(scene)
 
 
@@ -289,7 +290,7 @@ def test_photos_of_12_bits_are_brightened_and_said(suffix: str, channels: int, t
     edit_rig(folder, 1, file=f"images/001.{suffix}")
     write_image(folder / "images" / f"001.{suffix}", values)
     scene = load_scene(folder)
-    with pytest.warns(InputWarning, match=rf"001.{suffix}: 1 photos of 16 bits hold numbers of 12 bits at most"):
+    with warns_of("few_bits"):
         check_photos(scene)
     expected = (values >> 4).astype(np.uint8)
     np.testing.assert_array_equal(read_photo(scene, 1), expected if channels == 3 else np.dstack([expected] * 3))
@@ -311,7 +312,7 @@ def write_deep_photos(folder: Path, *highest: int) -> Path:
 def test_one_range_brightens_all_photos_of_a_scene(tmp_path: Path) -> None:
     """A dark photo of 12 bits whose numbers would fit into 10 stays darker than its neighbours."""
     scene = load_scene(write_deep_photos(write_scene(tmp_path / "plant", 3), 4095, 1000, 2000))
-    with pytest.warns(InputWarning, match=r"000.png: 3 photos of 16 bits hold numbers of 12 bits at most"):
+    with warns_of("few_bits"):
         check_photos(scene)
     assert [read_photo(scene, view).max() for view in range(3)] == [255, 1000 >> 4, 2000 >> 4]
     write_deep_photos(tmp_path / "plant", 4095, 65535, 2000)  # one uses all 16: so may all

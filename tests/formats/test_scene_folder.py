@@ -72,7 +72,7 @@ def test_binary_masks_are_warned_of(tmp_path: Path) -> None:
     for path in (folder / "masks").iterdir():
         labels = read_label_png(path, WIDTH, HEIGHT)
         write_label_png(path, np.where(labels > 0, 255, 0))
-    with pytest.warns(InputWarning, match="holds 0 and 255 only") as caught:
+    with pytest.warns(InputWarning) as caught:
         regions = load_masks(load_scene(folder), folder / "masks")
     assert {warning.filename for warning in caught} == {__file__}  # where the user called, not inside of mvseg
     assert regions.labels.tolist() == [255] * 4

@@ -12,11 +12,12 @@ import pytest
 import torch
 from PIL import Image
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.transforms_json import read_transforms
 from mvseg.scene import Scene
+from warned import warns_of
 
 CENTERS = np.array([[3.0, 0.5, 4.0], [-2.0, 1.0, 5.0], [0.5, 2.0, 4.5]])
 POINTS = np.array([[0.3, 0.2, 0.1], [-0.5, 0.4, 0.6], [0.0, 0.0, 0.0], [0.2, -0.7, -0.4]])
@@ -235,7 +236,7 @@ def test_an_applied_transform_that_bends(applied: np.ndarray, tmp_path: Path) ->
 def test_masks_of_nerfstudio_are_named(tmp_path: Path) -> None:
     content = transforms()
     content["frames"][1]["mask_path"] = "masks/b.png"
-    with pytest.warns(InputWarning, match=r"the mask_path of 1 frames is not used"):
+    with warns_of("mask_paths_not_used"):
         read(tmp_path, content)
 
 
@@ -265,7 +266,7 @@ def test_paths_of_another_machine(tmp_path: Path) -> None:
     content = transforms()
     for name, frame in zip("abc", content["frames"], strict=True):
         frame["file_path"] = f"/home/me/plant/photos/{name.upper()}.png"
-    with pytest.warns(InputWarning, match=r"3 photos are matched by their names alone, the first is images/a"):
+    with warns_of("photos_by_name"):
         scene = read(tmp_path, content)
     assert [view.name for view in scene.views] == ["a", "b", "c"]
     assert all(view.path.is_file() for view in scene.views)
@@ -273,7 +274,7 @@ def test_paths_of_another_machine(tmp_path: Path) -> None:
         for name, frame in zip("abc", content["frames"], strict=True):
             frame["file_path"] = f"{place}{name}.png"
         del content["w"], content["h"]
-        with pytest.warns(InputWarning, match=r"3 photos are matched by their names alone, the first is images/a"):
+        with warns_of("photos_by_name"):
             scene = read(tmp_path, content)
         assert all(view.path.is_file() for view in scene.views)
         content |= {"w": 200, "h": 120}

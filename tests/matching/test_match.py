@@ -1,20 +1,21 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 
 import numpy as np
 import pytest
 import torch
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, collect_warnings
 from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.findings.sentences import DISAGREEMENT
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions, odd_views
 from mvseg.matching.split import split_merged
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from synthetic import ball_scene, cameras_at, merged_balls, permute_views, render_balls
+from warned import warns_of
 
 
 @pytest.mark.parametrize("method", ["auto", "nview", "one-per-view", "symnmf"])
@@ -59,9 +60,8 @@ def test_same_seed_same_answer_and_any_order_of_views() -> None:
 def test_masks_of_photos_of_half_the_size_are_said(demo_scene: Scene, demo_regions: Regions) -> None:
     sizes = demo_scene.cameras.sizes.tolist()
     maps = [demo_regions.label_map(view, demo_regions.labels, size).numpy() for view, size in enumerate(sizes)]
-    with pytest.warns(InputWarning) as said:
+    with warns_of("masks_of_half_size"):
         match_regions(regions_from_label_maps([each[::2, ::2] for each in maps]), demo_scene.cameras)
-    assert "all masks lie in the upper left quarters of their photos" in str(said[0].message)
 
 
 def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
@@ -138,26 +138,31 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
     scene = ball_scene(6, 4, seed=7, radius=0.1)
     order = [2, 0, 3, 1]  # every photo has the pose of another
     cameras = Cameras(scene.cameras.K, scene.cameras.R[order], scene.cameras.t[order], scene.cameras.sizes)
-    with pytest.warns(InputWarning, match="the views hardly agree .*, and ids may be wrong: does each mask"):
+    with warns_of("views_disagree"):
         assert match_regions(scene.regions, cameras).report.method == "one-per-view"
 
 
 @pytest.mark.parametrize(
-    ("shift", "facts"),
-    [
-        (1, "5.% of the ids are expected to be right, at a reprojection error of 8 pixels or more"),
-        (-1, "(39|40|41)% of the ids are expected to be right, at a reprojection error of 8"),
-        (2, "..% of the ids are expected to be right, least in view 7, view 8"),
-    ],
+    ("shift", "code", "share", "views"),
+    [(1, "views_disagree", 0.55, ()), (-1, "views_disagree", 0.4, ()), (2, "views_odd", None, (7, 8))],
 )
 def test_cameras_of_other_photos_are_warned_of(
-    shift: int, facts: str, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+    shift: int,
+    code: str,
+    share: float | None,
+    views: tuple[int, ...],
+    demo_scene: Scene,
+    demo_regions: Regions,
+    demo_truth: torch.Tensor,
 ) -> None:
     """Of the next, the previous, and the next but one: there all but two photos agree with each other."""
     order = [(view + shift) % 9 for view in range(9)]
     cameras = dataclasses.replace(demo_scene.cameras, R=demo_scene.cameras.R[order], t=demo_scene.cameras.t[order])
-    with pytest.warns(InputWarning, match=rf"the views hardly agree \(.*{facts}.*\), and ids may be wrong: does"):
+    with warns_of(code) as noticed:
         matching = match_regions(demo_regions, cameras)
+    (disagreement,) = [each for each in noticed if each.code == code]
+    assert disagreement.views == views
+    assert share is None or disagreement.values["share"] == pytest.approx(share, abs=0.05)
     assert matching_metrics(matching.instance_ids, demo_truth).ari < 0.7
 
 
@@ -170,7 +175,7 @@ def test_a_mask_over_the_whole_plant_is_asked_about_and_not_the_cameras(
     ]
     maps[0] = np.minimum(maps[0], 1)
     regions = regions_from_label_maps(maps)
-    with pytest.warns(InputWarning, match=r"view 0 has few masks \(1 against \d+ as a rule\): .*cover"):
+    with warns_of("view_sparse"):
         match_regions(regions, demo_scene.cameras)
 
 
@@ -183,10 +188,10 @@ def test_scores_fall_with_the_poses(
     angles = torch.from_numpy(rng.normal(0, px / float(cameras.K[0, 0, 0]), (9, 3)))
     turn = torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).double()[None], angles[:, None, :], dim=2))
     turned = dataclasses.replace(cameras, R=turn @ cameras.R, t=(turn @ cameras.t[:, :, None])[:, :, 0])
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with collect_warnings() as noticed:
         matching = match_regions(demo_regions, turned)
-    assert [("reprojection error of 8 pixels or more" in str(each.message)) for each in caught] == [True] * is_warned
+    assert matching.report.residual_px == 8 or not is_warned
+    assert [each.code in DISAGREEMENT for each in noticed] == [True] * is_warned
     ari = matching_metrics(matching.instance_ids, demo_truth).ari
     mean = float(matching.match_scores[matching.instance_ids > 0].mean())
     assert (ari, mean > 0.95) == (1.0, True) if not is_warned else (ari < 0.6 and mean < 0.6)
@@ -203,7 +208,7 @@ def test_odd_views_explain_far_less_than_the_median() -> None:
 def test_empty_masks_are_data() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [0.0, 10, 0]]))
     nothing = regions_from_label_maps([torch.zeros(240, 320).numpy().astype(int)] * 2)
-    with pytest.warns(InputWarning, match="empty"):
+    with warns_of("no_masks"):
         matching = match_regions(nothing, cameras)
     assert matching.num_instances == 0
     assert matching.instance_ids.shape == (0,)
@@ -213,7 +218,7 @@ def test_two_cameras_that_share_a_centre_are_warned_of() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
     centers, radii = torch.tensor([[0.0, 1, 0], [0.0, -1, 1]]).double(), torch.tensor([0.5, 0.5]).double()
     regions = regions_from_label_maps(render_balls(cameras, centers, radii))
-    with pytest.warns(InputWarning, match="views 0 and 1 share a camera centre"):
+    with warns_of("centres_shared"):
         matching = match_regions(regions, cameras)
     assert matching_metrics(matching.instance_ids, regions.labels).ari == 1
 
@@ -231,16 +236,16 @@ def test_cameras_that_all_share_a_centre_are_refused(count: int) -> None:
 def test_many_pairs_that_share_a_centre_are_one_warning() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0]] * 6 + [[0.0, 10, 0]]))
     nothing = regions_from_label_maps([np.zeros((240, 320), np.int64)] * 7)
-    with pytest.warns(InputWarning) as caught:
+    with warns_of("centres_shared") as noticed:
         match_regions(nothing, cameras)
-    about = [str(each.message) for each in caught if "share a camera centre" in str(each.message)]
-    assert about == ["views 0 and 1 share a camera centre: so do 14 more pairs; all are skipped"]
+    (shared,) = [each for each in noticed if each.code == "centres_shared"]
+    assert (shared.where, shared.values) == ("views 0 and 1", {"count": 15})
 
 
 @pytest.mark.parametrize("num_views", [2, 4])
 def test_missing_masks_are_not_blamed_on_the_poses(demo_scene: Scene, demo_regions: Regions, num_views: int) -> None:
     few = demo_regions.select(demo_regions.view_index < num_views)
-    expected = f"{9 - num_views} of 9 views have at most half of the 12 masks of view 0: are masks missing there"
-    with pytest.warns(InputWarning, match=expected) as caught:
+    with warns_of("views_sparse") as noticed:
         match_regions(few, demo_scene.cameras)
-    assert not any("do R and t" in str(each.message) for each in caught)
+    (sparse,) = [each for each in noticed if each.code == "views_sparse"]
+    assert (sparse.where, sparse.values["count"], sparse.values["most"]) == ("view 0", 9 - num_views, 12)

@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 
 from mvseg.poses.cancellable import quiet_colmap
-from mvseg.poses.focal_length import FocalLength, _with_own_lenses, find_zooms, focal_lengths, least_sure, say_zooms
+from mvseg.poses.focal_length import FocalLength, _with_own_lenses, find_zooms, focal_lengths, least_sure, zoom_finding
 from room_scene import FOCAL
 
 
@@ -42,8 +42,8 @@ def test_two_zooms_that_are_to_share_a_lens_are_said() -> None:
     lengths = find_zooms(seen_by_one_lens(zoom=1.3))
     assert lengths is not None
     assert lengths[::2].mean() / lengths[1::2].mean() == pytest.approx(1.3, rel=0.02)
-    assert "focal lengths from " in (said := say_zooms(lengths, 1000.0))
-    assert "--shared_camera false" in said
+    finding = zoom_finding(lengths, 1000.0)
+    assert (finding.code, finding.values["low"], finding.values["high"]) == ("zooms", lengths.min(), lengths.max())
     one = seen_by_one_lens(zoom=1.0)
     assert find_zooms(one) is None
     assert find_zooms(_with_own_lenses(one)) is None  # they have
@@ -51,7 +51,7 @@ def test_two_zooms_that_are_to_share_a_lens_are_said() -> None:
 
 def test_what_is_not_sure_is_said() -> None:
     sure, unsure, given = FocalLength(800.0, 8.0), FocalLength(700.0, 7.1), FocalLength(900.0, None)
-    assert sure.doubts(mend="") == given.doubts(mend="") == []
-    expected = "focal length 700 +- 7.1 px (1.0%): lengths above the table are as uncertain; take more photos"
-    assert unsure.doubts(mend="take more photos") == [expected]
+    code = "focal_length_unsure"
+    assert sure.doubts(code) == given.doubts(code) == []
+    assert str(unsure.doubts(code)[0]).startswith("focal length 700 +- 7.1 px (1.0%): ")
     assert least_sure([sure, unsure, given]) == unsure

@@ -12,6 +12,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from warned import warns_of
 
 CAMERAS = ring_cameras(4)
 COARSE = ReconstructConfig(voxel_budget=2000)
@@ -32,9 +33,9 @@ def two_blades() -> tuple[Regions, torch.Tensor]:
 def test_instances_without_a_credible_surface_get_voxels(two_blades: tuple[Regions, torch.Tensor]) -> None:
     """The voxels that voxels alone would give: other instances hide as before."""
     surfaces = {n: LeafSurface.none(torch.arange(6 - 2 * n), "for the test") for n in (1, 2)}
-    with pytest.warns(UserWarning, match="instance 2 has no shape"):
+    with warns_of("no_shape"):
         voxels = reconstruct_voxels(*two_blades, CAMERAS, config=COARSE, surfaces=surfaces)
-    with pytest.warns(UserWarning, match="instance 2 has no shape"):
+    with warns_of("no_shape"):
         expected = reconstruct_instances(*two_blades, CAMERAS, config=COARSE)
     assert voxels.keys() == expected.keys() == {1}
     assert torch.equal(voxels[1].votes, expected[1].votes)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.numbers import VOXELS
 from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
@@ -17,6 +17,7 @@ from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from reference import back_project_reference, seen_share_reference
 from synthetic import arc_positions, ball_scene, cameras_at, moved, render_balls
+from warned import warns_of
 
 FAR = 1000.0  # cameras so far away that they see in parallel
 
@@ -205,14 +206,14 @@ def test_what_has_no_bounded_shape_is_left_out() -> None:
     maps[0][0:20, 0:20] = 1  # two masks that look past each other
     maps[1][300:320, 0:20] = 1
     apart = regions_from_label_maps(maps)
-    with pytest.warns(InputWarning, match="instance 1 has no shape"):
+    with warns_of("no_shape"):
         assert reconstruct_instances(apart, torch.tensor([1, 1]), cameras[:2]) == {}
 
 
 def test_nearly_parallel_views_are_cut_not_lost() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0.01, 0]]))
     maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
-    with pytest.warns(InputWarning, match="cut off"):
+    with warns_of("shape_cut_off"):
         grid = back_project(regions_from_label_maps(maps), cameras, config=ReconstructConfig(voxel_budget=20_000))
     assert grid is not None
     assert 0 < grid.volume < 1e5
@@ -230,7 +231,7 @@ def test_an_empty_grid_has_an_empty_mesh() -> None:
 
 def test_an_instance_without_a_voxel_is_left_out_and_warned_of() -> None:
     regions, cameras = ball_from(AXES)
-    with pytest.warns(InputWarning, match="instance 1 has no shape"):
+    with warns_of("no_shape"):
         assert reconstruct_instances(regions, regions.labels, cameras, config=ReconstructConfig(voxel_size=8.0)) == {}
 
 

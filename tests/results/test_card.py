@@ -6,49 +6,80 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 import torch
 
-from mvseg import demo
-from mvseg.checks.finding import Finding
+from mvseg.findings.finding import Finding
+from mvseg.findings.sentences import SENTENCES, UNSURE_IDS
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions
-from mvseg.results.card import make_card
-from mvseg.results.result import Instances, Result
+from mvseg.results.card import BY_HAND, ONE_SIDED, SHAPES, SIDES, UNTAUGHT, make_card
+from mvseg.results.result import Instances, Learned, Result
 from mvseg.scene import Scene
-from mvseg.verification.unexplained import Missing
 
-OUT, SCENE = Path("out"), demo.demo_scene()
-
-
-def test_what_matters_most_is_said_with_what_helps(
-    demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
-) -> None:
-    result = Result(demo_scene, Matching(Masks.of(demo_regions, demo_truth), MatchReport("nview")))
-    sound = make_card(result, OUT, scene=SCENE)
-    assert (sound.found, sound.doubt) == ("12 leaves in 9 photos", "")
-    assert sound.next_step == "mvseg correct out asks about what is doubtful"
-    unsure = replace(result, disagreement="the views hardly agree")
-    assert make_card(unsure, OUT, scene=SCENE).doubt == "the views hardly agree"
-    assert make_card(unsure, OUT, scene=SCENE).next_step == f"mvseg check {SCENE} says what to do"
-    unsure = replace(unsure, missing=Missing("most are missing", "outline some"))
-    lacking = make_card(unsure, OUT, scene=SCENE)
-    assert (lacking.doubt, lacking.next_step) == ("most are missing", "outline some")
-    found = Finding("poses", "features of the photos do not fit", "error", (0, 2, 3, 5))
-    wrong = make_card(replace(unsure, contradictions=(found,)), OUT, scene=SCENE, masks=Path("masks"))
-    assert wrong.doubt == "the cameras of 000, 002, 003 and 1 more do not fit the others: ids and shapes may be wrong"
-    assert wrong.next_step == f"mvseg check {SCENE} --masks masks says what to do"
+OUT = Path("out")
+TEACH = "let the views teach the detector this plant: mvseg infer --again out --learn 2"
+ONE = Finding("one_sided", values={"degrees": 17.0})
+MISSED = Finding("leaves_missed", values={"share": 0.78})
+OFF = Finding("view_off", "view 2 (002)", {"share": 0.1, "px": 30.0}, (2,), "error")
+UNSURE = Finding("views_disagree", values={"share": 0.7})
 
 
-def test_doubtful_shapes_are_named_and_an_area_has_the_digits_that_are_known(
-    demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
-) -> None:
-    good, bad = (SimpleNamespace(quality=SimpleNamespace(is_good=is_good)) for is_good in (True, False))
+@pytest.fixture
+def result(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> Result:
+    return Result(demo_scene, Matching(Masks.of(demo_regions, demo_truth), MatchReport("nview")))
+
+
+def test_a_sound_result_has_no_doubt(result: Result) -> None:
+    card = make_card(result, OUT)
+    assert card.as_json() == {
+        "found": "12 leaves in 9 photos",
+        "doubt": "",
+        "next_step": "answer questions about doubtful leaves: mvseg correct out",
+    }
+
+
+def test_the_cause_that_explains_most_is_named(result: Result) -> None:
+    findings = (UNSURE, MISSED, OFF, ONE)
+    for number in range(1, 5):
+        assert make_card(replace(result, findings=findings[:number]), OUT).doubt == findings[number - 1]
+    assert make_card(replace(result, findings=(Finding("unknown_up", level="note"),)), OUT).doubt is None
+    card = make_card(replace(result, findings=findings), OUT)
+    assert card.as_json()["doubt"].startswith("you walked 17 degrees round the plant")
+
+
+def test_the_next_step_is_a_command(result: Result) -> None:
+    steps = {each.code: make_card(replace(result, findings=(each,)), Path("my out")).next_step
+             for each in (OFF, MISSED, UNSURE)}  # fmt: skip
+    assert steps["view_off"].endswith(": mvseg check 'my out'")
+    assert steps["views_disagree"].endswith(": mvseg check 'my out'")
+    assert steps["leaves_missed"].endswith(": mvseg infer --again 'my out' --learn 2")
+
+
+@pytest.mark.parametrize(
+    "learned", [Learned(rounds=1, agreed_area=(3.0, 9.0)), Learned(agreed_area=(3.0, 3.1)), None]
+)
+def test_learning_is_not_advised_right_after_it(learned: Learned | None, result: Result) -> None:
+    findings = (MISSED, *(() if learned else (Finding("learned_too_few", values={"count": 1, "least": 3}),)))
+    after = replace(result, findings=findings, learned=learned or Learned(agreed_area=(3.0,)))
+    assert make_card(after, OUT).next_step.endswith("let the detector learn them: mvseg correct out")
+    assert make_card(replace(after, learned=Learned(agreed_area=(3.0,)), findings=(MISSED,)), OUT).next_step == TEACH
+
+
+def test_codes_of_the_card_have_sentences() -> None:
+    assert {*ONE_SIDED, *UNTAUGHT, *BY_HAND, *UNSURE_IDS, *SIDES, *SHAPES} <= SENTENCES.keys()
+
+
+def test_doubtful_shapes_are_named_and_an_area_has_the_digits_that_are_known(result: Result) -> None:
     area = SimpleNamespace(value=8484.2, sd=159.4, exists=True)
     whole = {"total_leaf_area": area, "number_of_leaves": SimpleNamespace(value=9.0)}
     traits = SimpleNamespace(whole=whole, unit="mm")
-    shapes = Instances(surfaces={8: bad, 2: bad, 3: good}, traits=traits)  # type: ignore[dict-item,arg-type]
-    matching = Matching(Masks.of(demo_regions, demo_truth), MatchReport("nview"))
-    card = make_card(Result(demo_scene, matching, instances=shapes), OUT, scene=SCENE)
+    measured = replace(
+        result,
+        instances=Instances(traits=traits),  # type: ignore[arg-type]
+        findings=(Finding("doubtful_shapes", values={"count": 2, "total": 12, "leaves": ("2", "8")}, level="note"),),
+    )
+    card = make_card(measured, OUT)
     assert card.found == "12 leaves in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2"
-    assert card.doubt == "the shapes of leaves 2 and 8 are doubtful: the page says why"
+    assert str(card.doubt) == "the shapes of 2 of 12 leaves are doubtful (2, 8): the page says why"

@@ -21,7 +21,7 @@ import mvseg.results.plant_files
 import mvseg.results.report.page
 from known_leaves import bent_blade
 from mvseg.config import RunConfig
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
@@ -52,6 +52,7 @@ from scene_folders import (
     write_image,
     write_scene,
 )
+from warned import warns_of
 
 DISTORTION = [-0.8, 0.3, 0.01, -0.01, 0.0]
 DISTORTED = 2  # the view
@@ -594,7 +595,7 @@ class TestReadInstances:
     def test_photos_without_truth_are_left_out_and_counted(self, saved: Path, plant: Path, tmp_path: Path) -> None:
         for view in (0, 3):
             shutil.copy(plant / "truth" / f"{view:03d}.png", tmp_path)
-        with pytest.warns(InputWarning, match="2 of 4 photos have no true labels"):
+        with warns_of("no_true_labels"):
             regions, truth = read_instances(saved, tmp_path)
         every, all_truth = read_instances(saved, plant / "truth")
         assert regions.num_per_view.tolist() == every.num_per_view[[0, 3]].tolist()

@@ -23,6 +23,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import Corrections, Reject
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.run_lengths import decode_crop, decode_rle, encode_mask
@@ -83,7 +84,7 @@ def rich(balls: Result) -> Result:
     config = TraitsConfig(min_sure_views=0, min_visible_share=0, min_quality=0.9, leaves_only=False)
     voxels = {1: balls.voxels[1]}
     traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels, config=config)
-    assert traits.rejected == {"low_quality": 1}
+    assert [*traits.rejected.values()] == ["low_quality"]
     return Result(
         scene=scene,
         matching=matching,
@@ -101,14 +102,17 @@ def ids_only(balls: Result) -> Result:
     return replace(balls, instances=Instances())
 
 
+ODD = Finding("images_missing", "masks.json", {"count": 1, "first": "a", "found": ("b", "c")}, (1,))
+
+
 @pytest.mark.parametrize("name", ["balls", "rich", "ids_only"])
 def test_there_and_back(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     result = request.getfixturevalue(name)
-    save_result(result, tmp_path / "out", {"mvseg": "1.2.3", "warnings": ["odd"], "config": {"seed": 5}})
+    save_result(result, tmp_path / "out", {"mvseg": "1.2.3", "findings": [ODD.as_json()], "config": {"seed": 5}})
     loaded = load_result(tmp_path / "out")
     assert_same_result(result, loaded)
     assert loaded.run is not None
-    assert (loaded.run.mvseg, loaded.run.warnings, loaded.run.config) == ("1.2.3", ("odd",), {"seed": 5})
+    assert (loaded.run.mvseg, loaded.run.list_findings(), loaded.run.config) == ("1.2.3", (ODD,), {"seed": 5})
     for view, again in zip(result.scene.views, loaded.scene.views, strict=True):
         assert view.path.resolve() == again.path
         assert (view.lens is None) == (again.lens is None)
@@ -272,7 +276,7 @@ def test_files_that_run_json_does_not_list_are_refused(
     ("key", "value", "message"),
     [
         ("traits", {"unit": 3}, r"run\.json: traits\.unit: "),
-        ("warnings", "odd", r"run\.json: warnings: "),
+        ("findings", "odd", r"run\.json: findings: "),
         ("edits", [{"op": "sparkle"}], "edit 1: "),
         ("format", 0, "format: Input should be greater than or equal to 1"),
     ],

@@ -16,11 +16,12 @@ import torch
 
 from batch_work import square, start_lightly
 from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.reconstruction.numbers import SEARCH
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.system.running import running
 from mvseg.system.worker_pool import default_workers, load_ahead, map_in_order, run_all, start_workers
+from warned import warns_of
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
 
@@ -43,7 +44,7 @@ def test_answers_come_in_order_from_other_processes(workers: ProcessPoolExecutor
 
 
 def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor) -> None:
-    with pytest.warns(InputWarning, match=r"^7 is odd$"):
+    with warns_of("dark_photo"):
         assert next(map_in_order(square, [7], workers))[0] == 49
     with pytest.raises(InputError, match=r"^13 brings bad luck$"):
         list(map_in_order(square, [1, 13, 2], workers))

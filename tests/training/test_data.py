@@ -20,6 +20,7 @@ from pycocotools import mask as coco_mask
 from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.training.data import Sample, check_samples, keep_sound, list_samples, read_sample
+from warned import warns_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
 
@@ -142,13 +143,13 @@ def test_overlaps_classes_and_crowds(tmp_path: Path) -> None:
             {"segmentation": compressed(BAR), "category_id": 9},
         ],
     )
-    with pytest.warns(InputWarning, match=r"instances.json: 1 annotations with iscrowd are ignored"):
+    with warns_of("crowds_ignored"):
         labelled = read_sample(list_samples(tmp_path / "photos", path, crowd="ignore").samples[0])
     assert labelled.classes.tolist() == [1, 2]  # by category id: leaf 4, stem 9
     np.testing.assert_array_equal(masks_of(labelled), [SQUARE, BAR])
     assert len(labelled.layers) == 2
     np.testing.assert_array_equal(labelled.ignore.numpy(), crowd & ~SQUARE & ~BAR)
-    with pytest.warns(InputWarning, match=r"1 annotations with iscrowd are taken as masks"):  # as a run takes them
+    with warns_of("crowds_taken"):  # as a run takes them
         labelled = read_sample(list_samples(tmp_path / "photos", path).samples[0])
     np.testing.assert_array_equal(masks_of(labelled), [SQUARE, crowd, BAR])
 
@@ -157,7 +158,7 @@ def test_coco_is_read_as_for_a_scene(tmp_path: Path) -> None:
     """Ids as text, names of another program, an image without a size; and what stands twice or reads as nothing."""
     image = IMAGE | {"id": "7", "file_name": "images/5f1c0e7a-A.png", "height": 0, "width": 0}
     square = {"segmentation": compressed(SQUARE), "category_id": "4"}
-    with pytest.warns(InputWarning, match="1 names fit a photo by the base name only, the first is images/5f1c0e7a-A"):
+    with warns_of("base_names"):
         labelled = read_coco(tmp_path, [square], {"images": [image]})
     np.testing.assert_array_equal(masks_of(labelled), [SQUARE])
     with pytest.raises(InputError, match=r"images 7 \(a.png\) and 8 \(a.png\) are of one photo"):
@@ -173,7 +174,7 @@ def test_masks_of_other_kinds_are_read_as_for_a_scene(tmp_path: Path) -> None:
     (tmp_path / "labels" / "a.txt").write_text(f"{square}\n0 0.5 0.5 0.1 0.1\n")
     found = list_samples(tmp_path / "photos", tmp_path / "labels")
     np.testing.assert_array_equal(masks_of(read_sample(found.samples[0])), [SQUARE])
-    with pytest.warns(InputWarning, match="1 entries of masks are boxes, lines, points or to be ignored, and are left"):
+    with warns_of("boxes_left_out"):
         assert check_samples(found.samples) == ([1], {})
     (tmp_path / "labels" / "a.txt").unlink()
     np.save(tmp_path / "labels" / "a.npy", np.stack([SQUARE, BAR]))
@@ -199,7 +200,7 @@ def test_labels_that_read_as_something_else(tmp_path: Path) -> None:
     ):
         keep_sound(found, "training", skip_broken=True)
     write_image(tmp_path / "labels" / "a.png", np.ones_like(small))
-    with pytest.warns(InputWarning, match="a mask covers more than 80% of 1 photos: if it is the background"):
+    with warns_of("background_masks"):
         check_samples(found.samples)
 
 
@@ -341,7 +342,7 @@ def test_photos_that_nobody_has_labelled_yet(kind: str, tmp_path: Path) -> None:
     ))  # fmt: skip
     with warnings.catch_warnings(action="ignore"):  # labelme: of photos without a file
         found = list_samples(tmp_path / "photos", tmp_path / "labels" if kind == "labelme" else labels)
-    with pytest.warns(InputWarning, match=r"2 of 3 training photos have no labels \(the first is b.png"):
+    with warns_of("photos_without_labels"):
         kept, _ = keep_sound(found, "training", skip_broken=False)
     assert len(kept) == 3
     kept, _ = keep_sound(found, "training", skip_broken=False, skip_unlabelled=True)

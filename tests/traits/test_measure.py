@@ -120,7 +120,7 @@ def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     scores = matching.match_scores.masked_fill(is_doubtful, 0.1)  # so instance 2 is surely seen by one view
     matching = matching.with_masks(replace(matching.masks, match_scores=scores))
     traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
-    assert traits.rejected == {"few_sure_views": 1}
+    assert traits.rejected == {2: "few_sure_views"}
     leaf = traits.leaves[1]
     assert leaf.reasons == ("rejected: 1 sure views, asked for are 2",)
     assert {name for name, n in leaf.numbers.items() if n.exists} == {"num_views", "sure_views", "iou"}

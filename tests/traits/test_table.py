@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from mvseg.formats.text_file import escape_text, format_number
-from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, PLANT_TRAITS, VOXEL_TRAITS
@@ -31,7 +30,7 @@ def traits_of(**changes: object) -> Traits:
     nothing = {trait.name: missing(reason) for trait in LEAF_TRAITS}
     first = LeafTraits(leaf=1, numbers=full, method="surface", reasons=(), rejection=None)
     second = LeafTraits(
-        leaf=2, numbers=nothing, method="surface", reasons=(reason, "two, three"), rejection=Rejection("stem", reason)
+        leaf=2, numbers=nothing, method="surface", reasons=(reason, "two, three"), rejection="stem"
     )
     whole = {trait.name: Measurement(-3.5, 0.5, "surface") for trait in PLANT_TRAITS}
     traits = Traits(plant="basil", unit="mm", leaves=(first, second), whole=whole, up=(0.0, 0.0, 1.0))

@@ -23,6 +23,7 @@ from mvseg.verification.leaf_scores import Candidates, leaf_features
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
+from warned import warns_of
 
 TRUE = true_maps()
 REGIONS, IDS = as_regions(TRUE)
@@ -271,7 +272,7 @@ def test_without_surfaces_matching_and_scores_decide() -> None:
 
 def test_cameras_on_one_side_are_said() -> None:
     alike = replace(CAMERAS, R=CAMERAS.R[[0] * 6], t=CAMERAS.t[[0] * 6] + 1e-3 * torch.arange(6)[:, None])
-    with pytest.warns(InputWarning, match="the cameras see the leaves from one side only"):
+    with warns_of("leaves_seen_from_one_side"):
         leaves = choose(matched_of(PROPOSALS, IDS), cameras=alike)
     none, more = matched_of(PROPOSALS, torch.full_like(IDS, -1)), (matched_of(PROPOSALS, IDS),)
     with pytest.warns(InputWarning, match="from one side only"):  # also where nothing was matched after an edit

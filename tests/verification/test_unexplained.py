@@ -15,7 +15,6 @@ from found_masks import FoundMasks, open_photos, see_masks
 from leafy_scene import write_leafy_scene
 from mvseg.config import RunConfig
 from mvseg.corrections.corrected import Fate
-from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
@@ -23,6 +22,7 @@ from mvseg.pipeline.finish import finish
 from mvseg.verification.numbers import EVIDENCE
 from mvseg.verification.unexplained import find_missing, share_unexplained
 from three_leaves import true_maps
+from warned import warns_of
 
 MAPS = true_maps()
 REGIONS, IDS = as_regions(MAPS)
@@ -60,20 +60,16 @@ def test_a_plant_that_is_found_whole_is_not_spoken_of() -> None:
 def test_what_is_missing_is_said_once() -> None:
     share = share_unexplained(found((2,)), photo)
     assert share > 0.5
-    said = find_missing(found((2,)), photo, sure_score=0.3)
-    assert said is not None
-    assert said.why.startswith(f"{share:.0%} of what has the colour")
-    assert "mvseg correct" in said.helps
-    untaught = find_missing(found((2,)), photo, sure_score=0.3, may_learn=False)
-    assert untaught is not None
-    assert "--learn 2" in untaught.helps
+    missed = find_missing(found((2,)), photo, sure_score=0.3)
+    assert missed is not None
+    assert (missed.code, missed.values["share"]) == ("leaves_missed", share)
     unknown = find_missing(found((1, 2, 3), score=0.2), photo, sure_score=0.3)
     assert unknown is not None
-    assert "does not know this species" in unknown.why
+    assert unknown.code == "species_unknown"
     nothing = replace(found((1,)), instance_ids=torch.full((len(found((1,))),), -1))
     missing = find_missing(nothing, photo, sure_score=0.3)
     assert missing is not None
-    assert "no leaf" in missing.why
+    assert missing.code == "no_leaves"
     by_hand = replace(found((1, 2, 3)), detection_scores=torch.full((len(IDS),), torch.nan))
     assert find_missing(by_hand, photo, sure_score=0.3) is None
 
@@ -83,9 +79,9 @@ def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path, monkeypatch: pytest.Mo
     leafy = write_leafy_scene(tmp_path, num_leaves=1, num_views=3, size=64, span_deg=120)
     nothing = Masks.of(leafy.regions.select(torch.zeros(0, dtype=torch.int64)), origin=Origin.DETECTED)
     see_masks(monkeypatch, FoundMasks.of(Matching(nothing, MatchReport("none"))))
-    with pytest.warns(InputWarning, match="the detector finds nothing that scores"):
+    with warns_of("nothing_detected"):
         known = find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None)))
-    with pytest.warns(InputWarning, match="no leaf was found"):
+    with warns_of("no_leaves"):
         finish(known)
     rejected = replace(known, edits=(Fate(1, "reject", "applied"),))
     with warnings.catch_warnings():

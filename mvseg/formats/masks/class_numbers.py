@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.regions import IGNORE_LABEL, Regions
 
 BINARY = 255  # written by segmenters that only separate leaf from background
@@ -41,7 +42,7 @@ def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> N
             see `is_interpolated`.
     """
     if len(regions) and bool((regions.labels == BINARY).all()):
-        warn(f"{source}: holds 0 and 255 only, so that each photo shows one instance; leaves need a number each")
+        warn(Finding("one_number", str(source)))
         return
     is_apart = [has_components_apart(regions.crop(index).numpy()) for index in range(len(regions))]
     in_view = Counter(view for view, apart in zip(regions.view_index.tolist(), is_apart, strict=True) if apart)
@@ -55,9 +56,7 @@ def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> N
     num_photos = int((regions.num_per_view > 0).sum())
     number, count = with_number.most_common(1)[0] if with_number else (0, 0)
     if count > max(1, MANY * num_photos):
-        message = f"the number {number} has parts far apart in {count} of {num_photos} photos, as a class does"
-        advice = "export a number per leaf (VOC's SegmentationObject, not SegmentationClass), or COCO"
-        warn(f"{source}: {message}: {advice}")
+        warn(Finding("class_numbers", str(source), {"number": number, "count": count, "total": num_photos}))
 
 
 INTERPOLATED = (

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mvseg.errors import InputError, warn
-from mvseg.formats.find_views import list_some
+from mvseg.findings.finding import Finding
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +47,8 @@ def check_categories(
             there = ", ".join(present) or "none"
             raise InputError(f"{source}: there is no category '{name}', expected of these: {there}")
     several = [name for name in counts if name and counts[name]]
-    shown = list_some([f"{counts[name]} {name}" for name in several])
+    shown = tuple(f"{counts[name]} {name}" for name in several)
     if several and wanted and not set(several) & set(wanted):
-        warn(f"{source}: none of the masks is of the category {' or '.join(wanted)}, but {shown}")
+        warn(Finding("no_mask_of_category", str(source), {"wanted": tuple(wanted), "shown": shown}))
     if len(several) > 1 and not wanted:
-        warn(f"{source}: masks of {len(several)} categories are taken alike ({shown}); --categories selects some")
+        warn(Finding("several_categories", str(source), {"count": len(several), "shown": shown}))

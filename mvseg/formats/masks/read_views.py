@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import describe_turn
 from mvseg.formats.label_png import ignore_border, read_label_image, read_mask_images
 from mvseg.formats.masks.found_mask import FoundMask, check_categories
@@ -34,7 +35,7 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
     counts: Counter[str] = Counter()
     num_boxes = num_borders = 0
     if found.kind == YOLO_TRACKS:
-        warn(f"{found.source}: the last two numbers of each line are taken for a confidence and a track, and left out")
+        warn(Finding("confidence_and_track", str(found.source)))
     for view in range(len(found.files)):
         try:
             content = read_photo_masks(found.files[view], found.kind, scene.cameras.sizes[view].tolist())
@@ -50,13 +51,12 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
         taken = [each for each in content if not wanted or each.category in wanted]
         yield [(each.label, each.mask) for each in taken if each.mask is not None]
     if num_borders:
-        what = f"in {num_borders} label images, 255 lies around the others (VOC's border), and is ignored"
-        warn(f"{found.source}: {what}")
+        warn(Finding("border_ignored", str(found.source), {"count": num_borders}))
     if num_boxes:
         what = f"{num_boxes} entries are boxes, lines, points or to be ignored"
         if not counts.total():
             raise InputError(f"{found.source}: {what}, and none is a mask")
-        warn(f"{found.source}: {what}, and are left out")
+        warn(Finding("boxes_left_out", str(found.source), {"count": num_boxes}))
     if any(map(bool, counts)) or wanted:
         check_categories(counts, wanted, source=found.source)
 

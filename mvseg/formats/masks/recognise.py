@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.errors import InputError, warn
-from mvseg.formats.find_views import PhotoSet, base_name, find_views, list_some
+from mvseg.findings.finding import Finding, list_some
+from mvseg.formats.find_views import PhotoSet, base_name, find_views
 from mvseg.formats.masks.other_json import refuse_other
 from mvseg.formats.masks.yolo import YOLO_TRACKS, has_tracks
 
@@ -86,7 +87,7 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     others = [f"{each} for {count}" for each, count in counts.items() if each != kind]
     others += [f"{each} ({reason})" for each, reason in unclear.items()]
     if others:
-        warn(f"{masks}: {kind} for {counts[kind]} photos are taken, and not {', '.join(others)}")
+        warn(Finding("other_kinds", str(masks), {"kind": kind, "count": counts[kind], "others": tuple(others)}))
     find_views([f"{name}.png" for name in groups[kind]], scene, source=folder, warn_of_loose=True)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
@@ -139,9 +140,9 @@ def _fit(names: dict[str, list[Path]], scene: PhotoSet, folder: Path, *, kind: s
     stems, problem = [f"{name}.png" for name in names], None
     views: list[int | None] = [None] * len(stems)
     try:
-        views = find_views(stems, scene, source=folder)
+        views = find_views(stems, scene, source=None)
     except InputError as error:
-        problem = str(error).removeprefix(f"{folder}: ")
+        problem = str(error)
     bases = [base_name(view.name) for view in scene.views]
     by_base = {base: view for view, base in enumerate(bases) if kind != ONE_PER_MASK and bases.count(base) == 1}
     for (name, paths), stem, view in zip(names.items(), stems, views, strict=True):
@@ -165,7 +166,7 @@ def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> File
         return tuple(paths or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
     missing = [f"view {view} ({scene.views[view].name})" for view, paths in enumerate(files) if not paths]
     if missing:
-        warn(f"{folder}: {len(missing)} photos have no file and no masks, the first is {missing[0]}")
+        warn(Finding("files_missing", str(folder), {"count": len(missing), "first": missing[0]}))
     return files
 
 

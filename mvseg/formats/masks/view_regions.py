@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputError, warn
-from mvseg.formats.find_views import name_views
+from mvseg.findings.finding import Finding, list_findings
 from mvseg.formats.lens import undistort
 from mvseg.formats.masks.class_numbers import check_numbers, count_between
 from mvseg.formats.masks.faults import mask_faults
@@ -72,8 +72,8 @@ def stack_views(
         check_numbers(regions, between, source=source)
     if scene is not None and len(regions):  # without any, a run says so
         names = [view.name for view in scene.views]
-        for views_of, what in mask_faults(regions, scene.cameras.sizes.tolist()):
-            warn(f"{source}: {what.replace('{}', name_views(views_of, names)) if views_of else what}")
+        for fault in list_findings(mask_faults(regions, scene.cameras.sizes.tolist()), names):
+            warn(fault)
     return regions
 
 
@@ -103,17 +103,16 @@ def _without_copies(regions: Regions, *, source: object) -> Regions:
         if not is_copy[one] and shared >= SAME * (areas[one] + areas[other] - shared):
             is_copy[other] = True
     if is_copy.any():
-        what = f"{source}: {int(is_copy.sum())} of {len(regions)} masks are nearly another mask of their photo"
-        warn(f"{what} (IoU of {SAME} or more), and are left out")
+        values = {"count": int(is_copy.sum()), "total": len(regions), "iou": SAME}
+        warn(Finding("copies", str(source), values))
     return regions.select(~is_copy)
 
 
 def _say_left_out(num_kept: int, num_empty: int, num_twice: int, *, source: object) -> None:
     if num_empty:
-        what = f"{source}: {num_empty} masks show no pixel (empty, or outside of the undistorted photo)"
         if not num_kept:
-            raise InputError(f"{what}, and no others are there")
-        warn(f"{what} and are left out")
+            what = f"{num_empty} masks show no pixel (empty, or outside of the undistorted photo)"
+            raise InputError(f"{source}: {what}, and no others are there")
+        warn(Finding("masks_without_pixels", str(source), {"count": num_empty}))
     if num_twice:
-        total = num_kept + num_twice
-        warn(f"{source}: {num_twice} of {total} masks stand twice, pixel for pixel in one photo, and are taken once")
+        warn(Finding("masks_twice", str(source), {"count": num_twice, "total": num_kept + num_twice}))

@@ -29,8 +29,7 @@ SCRIPTS = (
     "lens.js", "edits.js", "brush.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
 )  # fmt: skip
 RUN_FIELDS = (
-    "card", "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "warnings", "checks",
-    "inputs",
+    "card", "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "findings", "inputs",
 )  # fmt: skip
 
 

@@ -12,10 +12,11 @@ import torch
 from pycocotools import mask as coco_mask
 
 from mvseg import regions_from_masks, with_instance_ids
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_scene
+from warned import warns_of
 
 MASKS = np.zeros((3, 20, 30), bool)
 MASKS[0, 2:9, 3:12], MASKS[1, 5:18, 5:20], MASKS[2, 10:12, 25:28] = True, True, True  # the first two overlap
@@ -74,7 +75,7 @@ def test_ids_go_back_to_their_masks(name: str) -> None:
     masks = MASKS.copy()
     masks[1] = False
     views = [FORMS[name](masks), FORMS[name](BACKGROUND), FORMS[name](MASKS[1:])]
-    with pytest.warns(InputWarning, match=r"masks in memory: 1 masks show no pixel"):
+    with warns_of("masks_without_pixels"):
         regions = regions_from_masks(views)
     given = with_instance_ids(views, regions, torch.tensor([5, 2, -1, 9]))
     expected = [[5, -1, 2], [], [-1, 9]]

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.masks.class_numbers import BAND, count_between, has_components_apart
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import IGNORE_LABEL
 from scene_folders import HEIGHT, WIDTH, write_image, write_scene
+from warned import warns_of
 
 CLASSES = np.zeros((HEIGHT, WIDTH), np.uint16)
 CLASSES[10:30, 10:30] = CLASSES[10:30, 90:110] = 15  # two leaves
@@ -30,7 +31,7 @@ def test_a_number_per_class_is_warned_of(kind: str, tmp_path: Path) -> None:
         if kind == "npy":
             np.save(path.with_suffix(".npy"), CLASSES)
             path.unlink()
-    with pytest.warns(InputWarning, match=r"masks: the number 15 has parts far apart in 4 of 4 photos.*Segmentation"):
+    with warns_of("class_numbers"):
         assert len(load_masks(load_scene(folder), folder / "masks")) == 8
 
 

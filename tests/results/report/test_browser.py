@@ -184,8 +184,7 @@ def test_hostile_names_are_read_as_text(opened: Viewer) -> None:
     assert opened.page.title() == f"plant {HOSTILE} - mvseg"
     assert opened.page.locator("#plant").inner_text() == f"plant {HOSTILE}"
     assert opened.page.locator("#tiles figcaption span").nth(2).inner_text() == f"2 {HOSTILE}"
-    assert opened.page.locator("#warnings li").inner_text() == f"warned {HOSTILE}"
-    assert opened.page.locator("#checks li").inner_text() == f"error, photos: found {HOSTILE}"
+    assert opened.page.locator("#findings li").inner_text() == f"error, photos: found {HOSTILE}"
     opened.page.evaluate("selection.select(1)")
     assert opened.page.locator("#leaf .doubt li").inner_text() == f"doubt {HOSTILE}"
     assert opened.page.locator("#leaf .crops button").count() == 4

@@ -50,7 +50,7 @@ def test_hostile_names_stay_text(balls: Result, tmp_path: Path) -> None:
     data = json.loads(page.scripts[0])
     assert data["plant"] == f"plant {HOSTILE}"
     assert data["views"][2]["name"] == f"2 {HOSTILE}"
-    assert data["run"]["warnings"] == [f"warned {HOSTILE}"]
+    assert data["run"]["findings"][0]["sentence"] == f"found {HOSTILE}"
     assert json.loads(data["run"]["config"]) == RUN["config"]
     assert "files" not in data["run"]
 

@@ -1,4 +1,4 @@
-// The head of the page, and what is known of the run: warnings, versions, options.
+// The head of the page, and what is known of the run: findings, versions, options.
 
 function summarise(data) {
   const leaves = count(data.leaves.length, "leaf", "leaves");
@@ -21,19 +21,19 @@ function buildCard(card) {
 
 function buildRun(data) {
   const { run } = data;
-  const warnings = run.warnings ?? [];
+  const findings = run.findings ?? [];
+  const warnings = findings.filter(({ level }) => level !== "note");
   document.getElementById("plant").textContent = data.plant;
   summarise(data);
-  const link = document.getElementById("warnings-link");
+  const link = document.getElementById("findings-link");
   link.textContent = count(warnings.length, "warning");
   link.hidden = warnings.length === 0;
 
   buildCard(run.card);
 
-  const list = warnings.length
-    ? element("ul", {}, ...warnings.map((text) => element("li", {}, text)))
+  const list = findings.length
+    ? element("ul", {}, ...findings.map(({ level, topic, sentence }) => element("li", {}, `${level}, ${topic}: ${sentence}`)))
     : element("p", { class: "note" }, "There were none.");
-  const checks = (run.checks ?? []).map(({ level, where, what }) => element("li", {}, `${level}, ${where}: ${what}`));
   const facts = [
     ["mvseg", run.mvseg], ["Python", run.python], ["PyTorch", run.torch],
     ["masks", run.mask_kind ?? "found by a detector"], ["matched by", run.matched_by],
@@ -43,8 +43,7 @@ function buildRun(data) {
   ].filter(([, value]) => value !== null && value !== undefined && value !== "");
   const terms = facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]);
   document.getElementById("run").append(
-    element("div", { id: "warnings" }, element("h2", {}, "Warnings"), list),
-    ...(checks.length ? [element("div", { id: "checks" }, element("h2", {}, "Checks"), element("ul", {}, ...checks))] : []),
+    element("div", { id: "findings" }, element("h2", {}, "Findings"), list),
     element("div", {}, element("h2", {}, "Run"), element("dl", {}, ...terms)),
     element("details", {}, element("summary", {}, "Options"), element("pre", {}, run.config)),
   );
