@@ -121,12 +121,12 @@ def main() -> None:
         cache = CachedDetections(args.cache / folder.resolve().name)
         first = known = find_in_photos(opened, cache=cache)
         truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
-        print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {known.looks[0].longest} px\n")
+        print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {known.image_size} px\n")
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
         runs = [show("as it is", known, truth, stays="", begun=begun)]
         for size in args.sizes:
             begun, detect = time.process_time(), replace(config.detect, image_size=size)
-            seen = know(opened, look_once(opened, detect, cache=cache, boxes=first.looks[0].boxes))
+            seen = know(opened, look_once(opened, detect, cache=cache, boxes=first.boxes))
             runs.append(show(f"at {size} px", seen, truth, stays="", begun=begun))
         if args.next is not None:
             see_next(args.next, None, "the next plant", cache=cache)
@@ -135,7 +135,7 @@ def main() -> None:
             begun, before = time.process_time(), known
             known = learn(known, cache=cache, rounds=1)
             stays = stays and known.agreed_area >= GROWTH * before.agreed_area
-            name = f"round {number}, at {known.looks[0].longest} px"
+            name = f"round {number}, at {known.image_size} px"
             runs.append(show(name, known, truth, stays="yes" if stays else "no", begun=begun))
             if args.next is not None:
                 see_next(args.next, known.learned.weights, f"the next plant, weights of round {number}", cache=cache)

@@ -121,7 +121,7 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
     assert not taught
     learn(see(leafy, monkeypatch, score=0.6, learn=1), cache=CachedDetections(tmp_path))
     assert len(taught) == 1
-    smaller = replace(known, looks=(replace(known.looks[0], longest=round(SIZE * DETECTION.size_step)),))
+    smaller = replace(known, image_size=round(SIZE * DETECTION.size_step))
     learn(smaller, cache=CachedDetections(tmp_path))
     assert len(taught) == 2  # the detector sees the leaves best at another size than its own
     with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):

@@ -26,7 +26,7 @@ from mvseg.results.result import Instances
 from mvseg.verification.choose import LeftOut
 
 MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
-FIELDS = ("matching", "instances", "proposals", "matched", "left", "disagreement")
+FIELDS = ("matching", "instances", "proposals", "matched", "image_size", "boxes", "left", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [
     Approach,
@@ -64,7 +64,7 @@ def pack_known(known: Known, said: Sequence[Finding]) -> bytes | None:
 def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[Finding]] | None:
     """What `pack_known` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
 
-    There are no looks: a detector that is to learn looks again. None: it is of other views, or something else.
+    None: it is of other views, or something else.
     """
     try:
         inflated = zlib.decompressobj().decompress(content, MOST_BYTES + 1)
@@ -77,6 +77,6 @@ def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[Finding]] 
         surfaces = SurfaceCache(packed["approaches"], packed["surfaces"])
         snapped = {name: each.numpy() for name, each in packed["snapped"].items()}
         opened = replace(opened, surfaces=surfaces, snapped=snapped)
-        return Known(opened=opened, looks=(), **packed["known"]), packed["said"]
+        return Known(opened=opened, **packed["known"]), packed["said"]
     except Exception:  # zlib and torch raise many kinds at broken files
         return None

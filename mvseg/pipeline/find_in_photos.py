@@ -67,10 +67,11 @@ def _thin(opened: Opened) -> tuple[Opened, Tensor]:
     return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
 
 
-def look_near(opened: Opened, detect: DetectConfig, *, cache: CachedDetections | None, earlier: Look) -> Found:
-    """What weights find that have learned at the size of an earlier look: there, or at the size next to it where the
+def look_near(known: Known, detect: DetectConfig, *, cache: CachedDetections | None) -> Found:
+    """What weights find that have learned at the size of what is known: there, or at the size next to it where the
     views agree better, see `choose_near`; there alone where a size is given."""
-    boxes, few, views = earlier.boxes, *_thin(opened)
+    opened, boxes = known.opened, known.boxes
+    few, views = _thin(opened)
     if detect.image_size is not None:
         return look_once(opened, detect, cache=cache, boxes=boxes)
 
@@ -78,8 +79,7 @@ def look_near(opened: Opened, detect: DetectConfig, *, cache: CachedDetections |
         part = None if boxes is None else boxes[views]
         return look_once(few, replace(detect, image_size=size), cache=cache, boxes=part)
 
-    sides = opened.scene.cameras.sizes if boxes is None else boxes[:, 2:] - boxes[:, :2]
-    found = choose_near(see, earlier.longest, most=int(sides.max()))
+    found = choose_near(see, known.image_size, most=known.longest_side)
     if few is opened:
         return found
     return look_once(opened, replace(detect, image_size=found.looks[0].longest), cache=cache, boxes=boxes)
@@ -123,7 +123,8 @@ def know(opened: Opened, found: Found) -> Known:
         instances=Instances(),
         proposals=found.proposals,
         matched=found.matched,
-        looks=found.looks,
+        image_size=found.looks[0].longest,
+        boxes=found.looks[0].boxes,
         left=(),
         disagreement=opened.find_disagreement(matching),
     )

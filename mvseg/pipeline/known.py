@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mvseg.corrections.corrected import Fate, Refused
 from mvseg.findings.finding import Finding
@@ -25,7 +26,6 @@ from mvseg.verification.leaf_color import colors_of_leaves
 from mvseg.verification.leaf_scores import rate_pass
 
 if TYPE_CHECKING:
-    from mvseg.detection.find_leaves import Look
     from mvseg.verification.choose import Leaves, LeftOut
 
 
@@ -39,7 +39,9 @@ class Known:
         instances: `starts` and `probabilities` of those that the views chose; nothing else.
         proposals: R masks on the CPU, the excessive set of the detector; those that were given.
         matched: tables of masks of it that are matched, the sure ones first; () where masks were given.
-        looks: that it was proposed in; () where masks were given.
+        image_size: pixels, the longer side of the photos, or of their parts, as the detector saw them; 0 where masks
+            were given.
+        boxes: (V, 4) int64 xyxy, the parts of the photos that it looked at; None: all of them.
         left: candidates that the views did not choose.
         edits: what came of a person's edits; () without any.
         refused: pixels where a person says that no leaf is, and where no mask is.
@@ -52,7 +54,8 @@ class Known:
     instances: Instances
     proposals: Masks
     matched: tuple[Masks, ...]
-    looks: tuple[Look, ...]
+    image_size: int
+    boxes: Tensor | None
     left: tuple[LeftOut, ...]
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
@@ -73,6 +76,12 @@ class Known:
     def agreed_area(self) -> float:
         """Pixels, see `rate_pass`."""
         return rate_pass(self.masks, self.instances.probabilities)
+
+    @property
+    def longest_side(self) -> int:
+        """Pixels, of the photos or of their parts that the detector looked at."""
+        sizes = self.scene.cameras.sizes if self.boxes is None else self.boxes[:, 2:] - self.boxes[:, :2]
+        return int(sizes.max())
 
     @cached_property
     def shown(self) -> Masks:
@@ -125,7 +134,8 @@ def match_given(opened: Opened) -> Known:
         instances=Instances(),
         proposals=given.to("cpu"),
         matched=(),
-        looks=(),
+        image_size=0,
+        boxes=None,
         left=(),
         disagreement=opened.find_disagreement(matching),
     )

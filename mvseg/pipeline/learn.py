@@ -21,7 +21,6 @@ from mvseg._version import code_hash
 from mvseg.corrections.file import Corrections
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import Look
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
@@ -106,33 +105,31 @@ def _count_rounds(known: Known) -> int:
 
 def _is_smaller(known: Known) -> bool:
     """Whether the views chose a smaller size than the one that the detector begins with, see `choose_size`."""
-    detect, look = known.opened.config.detect, known.looks[0]
+    detect = known.opened.config.detect
     _, description = read_weights(weights_path(detect.weights))
     if detect.image_size is not None or description is None:
         return False
-    sizes = known.scene.cameras.sizes if look.boxes is None else look.boxes[:, 2:] - look.boxes[:, :2]
-    own = min(description.image_size, int(sizes.max()))
-    return look.longest < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
+    own = min(description.image_size, known.longest_side)
+    return known.image_size < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
 
 
 def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Known:
     """The scene, seen with the weights that the run began with once they have learned these labels."""
-    opened, look = known.opened, known.looks[0]
-    boxes = look.boxes
+    opened, boxes = known.opened, known.boxes
     if boxes is None:
         sizes = opened.scene.cameras.sizes
         boxes = torch.cat((torch.zeros_like(sizes), sizes), 1)
-    path = cache.learned(_describe(opened.config.detect, look, labels, boxes))
+    path = cache.learned(_describe(opened.config.detect, known.image_size, labels, boxes))
     if not path.is_file():
         with timed("learn"):
             content = _fine_tune(opened.config.detect, known, labels, boxes)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
-    found = look_near(opened, detect, cache=cache, earlier=look)
+    found = look_near(known, detect, cache=cache)
     with collect_warnings():
         seen = know(opened, found)
-    return replace(seen, learned=Learned(weights=_at_size(path, found.looks[0].longest)))
+    return replace(seen, learned=Learned(weights=_at_size(path, seen.image_size)))
 
 
 def _at_size(path: Path, size: int) -> bytes:
@@ -147,15 +144,17 @@ def _fine_tune(detect: DetectConfig, known: Known, labels: ViewLabels, boxes: Te
     _, description = read_weights(weights_path(detect.weights))
     if description is None or len(description.categories) != 1:
         raise InputError(f"{detect.weights} tells several kinds of objects apart, expected a detector of leaves alone")
-    detector = load_detector(detect.weights)
-    detector.transform = transform = known.looks[0].model.transform
-    device = next(known.looks[0].model.parameters()).device
-    learned = fine_tune(detector.to(device), known.opened.photos, labels, boxes=boxes)
+    detector = load_detector(detect.weights, image_size=known.image_size).to(_device())
+    learned = fine_tune(detector, known.opened.photos, labels, boxes=boxes)
     halves = {name: each.half() if each.is_floating_point() else each for name, each in learned.state_dict().items()}
-    return encode_weights(halves, replace(description, image_size=int(transform.max_size)))
+    return encode_weights(halves, replace(description, image_size=known.image_size))
 
 
-def _describe(detect: DetectConfig, look: Look, labels: ViewLabels, boxes: Tensor) -> str:
+def _device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+def _describe(detect: DetectConfig, image_size: int, labels: ViewLabels, boxes: Tensor) -> str:
     """All that learned weights depend on."""
     shown = [each.regions for each in (labels.leaves, labels.doubtful)]
     tensors = [boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
@@ -165,10 +164,10 @@ def _describe(detect: DetectConfig, look: Look, labels: ViewLabels, boxes: Tenso
         {
             "weights": hash_files(Path(weights_path(detect.weights))),
             "labels": digest.hexdigest(),
-            "size": int(look.model.transform.max_size),
+            "size": image_size,
             "steps": STEPS,
             "code": code_hash(),
             "torch": torch.__version__,
-            "device": next(look.model.parameters()).device.type,
+            "device": _device(),
         }
     )

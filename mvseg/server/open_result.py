@@ -211,7 +211,7 @@ class OpenResult:
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
         with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
-            learned = learn(self._seen, cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
+            learned = learn(self._known[0], cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
         if learned.learned.weights is None:
             raise InputError(" ".join(map(as_sentence, said)))
         self.learned = learned, said
@@ -276,12 +276,6 @@ class OpenResult:
             with collect_warnings():
                 self._before = known, shape_leaves(known).surfaces
         return self._before[1]
-
-    @cached_property
-    def _seen(self) -> Known:
-        """The same, with the looks of the detector."""
-        known, _ = self._known
-        return known if known.looks else find_in_photos(self.opened)
 
     def _before_edits(self) -> bytes | None:
         """What the run knew before edits; None where it said nothing, or where something has changed since."""

@@ -101,6 +101,7 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     before = run()
     assert said == ["odd"]
     assert known.instances.probabilities == before.instances.probabilities
+    assert (known.image_size, known.boxes) == (before.image_size, before.boxes)  # the detector learns from there
     assert [each.chance for each in known.left] == [each.chance for each in before.left]
     for state, other in ((known, before), (apply_edits(known, reject), apply_edits(before, reject))):
         np.testing.assert_array_equal(as_painted(state), as_painted(other))
