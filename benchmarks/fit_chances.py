@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.fit_costs import small_specs
 from benchmarks.tracking import read_places, see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Alignment, Habit, Poses, judge, link_gain, list_poses, refine
+from mvseg.tracking.align import Alignment, Habit, Poses, judge, list_poses, pose_gain, refine
 from mvseg.tracking.associate import link_leaves
 from mvseg.tracking.compare import compare_dates
 from mvseg.tracking.dates import PlantOnDate
@@ -37,7 +37,7 @@ from mvseg.tracking.place_dates import place_dates
 NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
 Dated = tuple[PlantOnDate, list[int]]
 Looked = dict[tuple[int, int], Poses]
-Placed = tuple[float, int, bool]  # gain of links, number of leaves, whether the pose is right
+Placed = tuple[float, int, bool]  # gain of the pose, number of leaves, whether the pose is right
 Seen = tuple[list[Leaves], list[np.ndarray], list[float], bool]  # by date: leaves, true ids (0: none), days; knows up
 
 
@@ -82,7 +82,7 @@ def fit_temper(plants: list[tuple[Seen, Looked]]) -> float:
 
 
 def judge_placed(seen: Seen, looked: Looked, *, is_other: bool) -> list[Placed]:
-    """Of each two dates, placed with all others: the gain of links, the number of leaves, and whether the pose is
+    """Of each two dates, placed with all others: the gain of poses, the number of leaves, and whether the pose is
     right."""
     habit = Habit.of([judge(poses, Habit()) for poses in looked.values()], "auto")
     poses, roots, _ = place_dates(len(seen[0]), looked, habit)
@@ -92,7 +92,7 @@ def judge_placed(seen: Seen, looked: Looked, *, is_other: bool) -> list[Placed]:
         right = False if is_other else is_right(seen, (earlier, later), refined)
         if roots[earlier] == roots[later] and len(refined.pairs) and right is not None:
             pair = of_pair.pair
-            found.append((link_gain(pair, refined.pose), pair.fewer, right))
+            found.append((pose_gain(pair, refined.pose), pair.fewer, right))
     return found
 
 

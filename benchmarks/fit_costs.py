@@ -2,7 +2,7 @@
 
 Tables and results of real plants are those of `benchmarks/tracking.py results`, that with the most leaves first; beside
 them, simulated plants of 2 to 9 leaves (SMALL) and two of 12 to 30. Dates at most three apart are put into the pose
-that fits their true pairs.
+that fits their true pairs; for `LINKS`, they are then bent as these say.
 Of each leaf, that it goes with its like on the other date, or with none, against all others, is made likeliest:
 exp(-cost) against 1 and the sum of exp(-cost) over the others. Each table, and either kind of simulated plants, counts
 by the root of how many leaves it has. Scales of places stay as they are but with --places-too. Prints `POSES` and
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
-from mvseg.tracking.align import _fit
+from mvseg.tracking.align import Alignment, _fit
+from mvseg.tracking.bent_costs import bend
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, Scales, costs_of, fitted_costs
 from mvseg.tracking.leaves import Pair, leaves_of
@@ -36,7 +37,7 @@ from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.track import track_leaves
 
 SMALL, RIDGE = 16, 3e-3
-SIZES, LINES = ("growth", "grown", "size", "spurt", "loose", "parting"), ("lines", "near")
+SIZES, CLOUD = ("growth", "grown", "size", "spurt", "loose", "parting"), ("cloud", "near")
 Series = dict[str, tuple[list[PlantOnDate], Labels]]
 Known = tuple[Pair, np.ndarray, np.ndarray]  # in one frame, and the true ids of either date
 
@@ -97,8 +98,12 @@ class Joined:
     count: int
 
 
-def join(known: list[Known]) -> Joined:
-    each = [Differences.of(pair, lines=True) for pair, _, _ in known]
+def join(known: list[Known], *, is_bent: bool) -> Joined:
+    each = []
+    for pair, one, other in known:
+        true = Alignment(np.eye(4), np.argwhere(one[:, None] == other))
+        first, widths = bend(pair, true) if is_bent else (pair.first, None)
+        each.append(Differences.of(replace(pair, first=first), widths, cloud=True))
     parts = {field.name: [getattr(one, field.name) for one in each] for field in fields(Differences)}
     flat = {name: np.concatenate([part.reshape(*part.shape[:-2], -1) for part in of], -1) for name, of in parts.items()}
     starts = np.cumsum([(0, 0), *((len(one), len(other)) for _, one, other in known)], axis=0)
@@ -121,7 +126,7 @@ def fit(groups: list[Joined], start: Scales, *, places: bool = False) -> Scales:
     `places`: those of places, too."""
     most = max(each.count for each in groups)
     weighted = [((each.count / most) ** 0.5, each) for each in groups]
-    names = [name for name in asdict(start) if name in SIZES or (places and (start.lines or name not in LINES))]
+    names = [name for name in asdict(start) if name in SIZES or (places and (start.cloud or name not in CLOUD))]
     first = np.log([getattr(start, name) for name in names])
 
     def unpack(x: np.ndarray) -> Scales:
@@ -141,13 +146,17 @@ def track_with(series: tuple[list[PlantOnDate], Labels], poses: Scales, links: S
         patch("mvseg.tracking.align.fitted_costs", costs),
         patch("mvseg.tracking.place_dates.fitted_costs", costs),
         patch("mvseg.tracking.compare.fitted_costs", costs),
+        patch("mvseg.tracking.bent_costs.fitted_costs", costs),
+        patch("mvseg.tracking.motions.fitted_costs", costs),
     ):
-        found = measure(truth, labels_of(track_leaves(dates)))
+        found = measure(truth, labels_of(track_leaves(dates), dates))
     return found["short"], found["long"]
 
 
-def _other_costs(pair: Pair, scales: Scales = POSES, *, poses: Scales, links: Scales) -> np.ndarray:
-    return fitted_costs(pair, links if scales is LINKS else poses)
+def _other_costs(
+    pair: Pair, scales: Scales = POSES, widths: np.ndarray | None = None, *, poses: Scales, links: Scales
+) -> np.ndarray:
+    return fitted_costs(pair, links if scales is LINKS else poses, widths)
 
 
 def main() -> None:
@@ -162,18 +171,22 @@ def main() -> None:
     num_species = len(parts)
     parts |= {" ".join(series): series for series in rest}
     known = {name: [pair for seen in series.values() for pair in known_pairs(*seen)] for name, series in parts.items()}
-    simulated = [join([pair for spec in specs for pair in known_pairs(*see_series(spec))])
+    simulated = [[pair for spec in specs for pair in known_pairs(*see_series(spec))]
                  for specs in (draw_specs(2, seed=0), small_specs())]  # fmt: skip
-    species, others = list(parts)[:num_species], {name: join(known[name]) for name in list(parts)[num_species:]}
     for left_out in ("", *parts):
-        seedlings = join([pair for name in species if name != left_out for pair in known[name]])
-        groups = [seedlings, *simulated, *(each for name, each in others.items() if name != left_out)]
-        poses, links = (fit(groups, start, places=args.places_too) for start in (POSES, LINKS))
+        species = [pair for name in list(parts)[:num_species] if name != left_out for pair in known[name]]
+        others = [known[name] for name in list(parts)[num_species:] if name != left_out]
+        poses, links = (
+            fit([join(group, is_bent=start is LINKS) for group in (species, *simulated, *others)], start,
+                places=args.places_too)
+            for start in (POSES, LINKS)
+        )  # fmt: skip
         if not left_out:
             for name, scales in (("POSES", poses), ("LINKS", links)):
                 print(name, "=", {key: round(value, 3) for key, value in asdict(scales).items()}, flush=True)
             continue
-        said = ", ".join(f"{loss(join(known[left_out]), scales):.3f}" for scales in (poses, links))
+        said = ", ".join(f"{loss(join(known[left_out], is_bent=bent), scales):.3f}"
+                         for bent, scales in ((False, poses), (True, links)))  # fmt: skip
         short, long = np.mean([track_with(seen, poses, links) for seen in parts[left_out].values()], 0)
         plants = f"{len(parts[left_out])} plants, {short:.3f} / {long:.3f}"
         print(f"without {left_out}: loss per leaf {said}; {plants}", flush=True)

@@ -398,7 +398,7 @@ def track_series(series: Series) -> tuple[Links, np.ndarray]:
     measures = []
     for plant, (dates, truth) in series.items():
         tracks, before = track_leaves(dates), dict[int, int]()
-        found = measure(truth, labels_of(tracks))
+        found = measure(truth, labels_of(tracks, dates))
         measures.append((found["short"], found["long"]))
         for row in tracks.rows:
             if row.leaf is not None:

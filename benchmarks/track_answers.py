@@ -33,7 +33,7 @@ def answer_questions(dates: Sequence[PlantOnDate], truth: Labels, most: int) -> 
     with running(keep=True):
         for _ in range(most + 1):
             tracks = track_leaves(dates, links=links)
-            measured.append(measure(truth, labels_of(tracks)))
+            measured.append(measure(truth, labels_of(tracks, dates)))
             questions = list_questions(tracks, links)
             if not questions:
                 break

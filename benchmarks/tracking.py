@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import itertools
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -131,10 +132,12 @@ def see_two_plants(one: SeriesSpec, other: SeriesSpec, *, turn: float) -> tuple[
 # --- measures
 
 
-def labels_of(tracks: Tracks) -> Labels:
-    """The track of each leaf of each date."""
+def labels_of(tracks: Tracks, dates: Sequence[PlantOnDate]) -> Labels:
+    """The track of each leaf of each date; a leaf that the tracks leave out as a stem is a track of its own."""
     track = {(row.date, row.leaf): row.track for row in tracks.rows if row.leaf is not None}
-    return [[track[index, leaf.leaf] for leaf in date.leaves] for index, date in enumerate(tracks.dates)]
+    left_out = itertools.count(-1, -1)
+    return [[track[index, leaf.leaf] if (index, leaf.leaf) in track else next(left_out) for leaf in date.leaves]
+            for index, date in enumerate(dates)]  # fmt: skip
 
 
 def measure(truth: Labels, found: Labels) -> dict[str, float]:
@@ -357,7 +360,7 @@ def compare_turned(series: dict[str, tuple[list[PlantOnDate], Labels]], num_draw
             rng = np.random.default_rng([draw, *plant.encode()])
             angles = rng.uniform(0, 360, len(dates))
             turned = [turn_date(date, angle) for date, angle in zip(dates, angles, strict=True)]
-            figures = measure(truth, labels_of(track_leaves(turned)))
+            figures = measure(truth, labels_of(track_leaves(turned), turned))
             found[index, draw] = figures["short"], figures["long"]
         short, long = found[index].mean(0)
         print(f"| ... {plant} | {short:.3f} | {long:.3f} |", flush=True)
@@ -378,7 +381,7 @@ def compare(series: dict[str, tuple[list[PlantOnDate], Labels]], methods: Sequen
         rows = []
         for plant, (dates, truth) in series.items():
             tracks = tracked[plant]
-            found = labels_of(tracks) if method == "mvseg track" else track_by(method, dates, tracks.poses)
+            found = labels_of(tracks, dates) if method == "mvseg track" else track_by(method, dates, tracks.poses)
             rows.append(measure(truth, found))
             if method == "mvseg track":
                 print(
@@ -392,11 +395,9 @@ def compare(series: dict[str, tuple[list[PlantOnDate], Labels]], methods: Sequen
 def calibrate(series: dict[str, tuple[list[PlantOnDate], Labels]], tracked: dict[str, Tracks]) -> None:
     """Print how often links of each probability are right, the expected calibration error, and the best stretch."""
     chances, rights = [], []
-    for plant, (_, truth) in series.items():
+    for plant, (dates, truth) in series.items():
         tracks = tracked[plant]
-        true = {
-            (n, leaf.leaf): truth[n][k] for n, date in enumerate(tracks.dates) for k, leaf in enumerate(date.leaves)
-        }
+        true = {(n, leaf.leaf): truth[n][k] for n, date in enumerate(dates) for k, leaf in enumerate(date.leaves)}
         before: dict[int, int] = {}
         for row in tracks.rows:
             if row.leaf is None:

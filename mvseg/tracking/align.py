@@ -20,11 +20,11 @@ from scipy.special import expit
 from mvseg.system.running import kept
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
+from mvseg.tracking.fitted_costs import POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN
 
-GUESS = (-0.79, 0.62, 1.48)  # offset, own and strange gain of `guess_chance`; `python benchmarks/fit_chances.py`
+GUESS = (-2.02, 0.99, 2.05)  # fitted: python benchmarks/fit_chances.py; offset, own and strange gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +103,7 @@ class Poses:
             return 1.0
         if not self.pair.fewer:
             return habit.still
-        return guess_chance(link_gain(self.pair, pose), self.pair.fewer)
+        return guess_chance(pose_gain(self.pair, pose), self.pair.fewer)
 
 
 @kept
@@ -139,7 +139,7 @@ def guess_chance(gain: float, leaves: int) -> float:
     """How likely a pose is right.
 
     Args:
-        gain: see `link_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
+        gain: see `pose_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
             others of the two dates says nothing more.)
         leaves: number of leaves of the date with fewer, >= 1. What they say is neither independent, then the sum would
             count, nor all the same, then the mean would: the sum counts over the root of their number.
@@ -149,9 +149,9 @@ def guess_chance(gain: float, leaves: int) -> float:
 
 
 @kept
-def link_gain(pair: Pair, pose: Floats) -> float:
-    """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers, by all that links count."""
-    costs = fitted_costs(pair.moved(pose), LINKS)
+def pose_gain(pair: Pair, pose: Floats) -> float:
+    """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers."""
+    costs = fitted_costs(pair.moved(pose))
     return float(-costs[tuple(best_pairs(costs).T)].sum())
 
 
@@ -191,8 +191,6 @@ def draw_poses(pair: Pair) -> Floats:
     """(H, 4, 4) poses, one or more for every pair of leaves."""
     first, second = pair.first, pair.second
     one, other = np.repeat(np.arange(len(first)), len(second)), np.tile(np.arange(len(second)), len(first))
-    ratio = np.abs(np.log(second.lengths[other] / first.lengths[one]))
-    one, other = one[ratio < ALIGN.alike_length], other[ratio < ALIGN.alike_length]
     poses = [np.zeros((0, 4, 4))]
     for ends in ((0, -1), (-1, 0)):  # the later midrib as it is, and from its other end where its base is not known
         keep = np.ones(len(one), bool) if ends[0] == 0 else ~(first.is_oriented[one] & second.is_oriented[other])

@@ -14,9 +14,9 @@ from mvseg.tracking.align import (
     Poses,
     guess_chance,
     judge,
-    link_gain,
     list_poses,
     pose_distances,
+    pose_gain,
     refine,
 )
 from mvseg.tracking.bent_costs import bent_costs
@@ -25,7 +25,7 @@ from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
-from mvseg.tracking.numbers import ALIGN, BENT, LINKING
+from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
@@ -89,13 +89,13 @@ def compare_dates(
         trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.pose, habit)
         if not len(alignment.pairs):
             continue
-        costs[earlier, later] = _link_costs(pair, alignment)
+        costs[earlier, later] = bent_costs(pair, alignment)
         otherwise[earlier, later] = _under_others(looked[earlier, later], pose, habit)
         is_step = roots[later] not in roots[earlier + 1 : later]
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
             motion = find_motion(pair, alignment.pose)
             if motion is not None:
-                both = link_gain(pair, alignment.pose) + motion.gain
+                both = pose_gain(pair, alignment.pose) + motion.gain
                 if motion.is_sure:  # the other turn is that of a second plant
                     trust[earlier, later] = max(trust[earlier, later], guess_chance(both, pair.fewer))
                 motions[earlier, later] = motion
@@ -124,14 +124,6 @@ def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
     return chances
 
 
-def _link_costs(pair: Pair, alignment: Alignment) -> Floats:
-    """(N, M) costs of leaves of two aligned dates being the same. Where few leaves are paired, they do not tell how the
-    plant bent."""
-    if len(alignment.pairs) < BENT.enough:
-        return fitted_costs(pair.moved(alignment.pose), LINKS)
-    return bent_costs(pair, alignment)
-
-
 def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
     """The costs where the leaves of a second motion are linked with each other only, and only if it is sure."""
     rows, columns = motion.pairs.T
@@ -142,5 +134,5 @@ def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
         part = pair.take(rows, columns)
         alignment = refine(part, motion.pose)
         if len(alignment.pairs):
-            parted[np.ix_(rows, columns)] = _link_costs(part, alignment)
+            parted[np.ix_(rows, columns)] = bent_costs(part, alignment)
     return parted

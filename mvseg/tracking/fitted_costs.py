@@ -1,5 +1,5 @@
 """How unlike two leaves of different dates are, by scales of greatest likelihood: for finding how dates stand to each
-other, and for linking the leaves of small plants.
+other, and for linking leaves (`bent_costs.py`).
 
 The cost of a pair is minus the logarithm of how much likelier its differences are between two sights of one leaf than
 between a leaf and a stranger. Each difference has a scale of its own, widened by the standard deviations that the
@@ -12,10 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
-from mvseg.tracking.numbers import BENT
+from mvseg.tracking.numbers import COSTS, SIGHTS
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,11 @@ class Scales:
         across: of the base, away from the stem.
         along, stretch: of the base up the stem, and more of it per height above the foot, for internodes stretch.
         turn: of the direction from base to tip.
-        growth: log size that is expected per day and room to grow, see `_size_costs`.
+        growth: log size that is expected per day and room to grow, see `size_costs`.
         grown: how much likelier it is than growing at the peak that a leaf has stopped.
         size, spurt: of the log size, and more of it per growth that is expected of a leaf that grows.
         loose: of the log size of leaves that only voxels show.
-        lines, near: weight and scale of the distances between midribs, see `_line_distances`; 0: they do not count.
+        cloud, near: weight and scale of the distance between surfaces, see `_cloud_distances`; 0: it does not count.
         parting: log of how much rarer a stranger's differences are at the peak, on a plant of one leaf.
     """
 
@@ -44,18 +45,19 @@ class Scales:
     size: float
     spurt: float
     loose: float
-    lines: float
+    cloud: float
     near: float
     parting: float
 
 
-# `python benchmarks/fit_costs.py` fits both, on seedlings, a maize, a basil and simulated plants, in true poses;
-# `grown` of links, whose fit is 0.233, was chosen (docs/notes/tracking.md). Poses are found by bases and directions:
-# midribs lie near each other in poses that are exact only.
+# fitted: python benchmarks/fit_costs.py, on seedlings, a maize, a basil and simulated plants in true poses; `cloud` and
+# `near` with --places-too. `grown` of links, fitted to 0.17, was chosen; why other scales stay as an earlier fit had
+# them stands in docs/notes/tracking.md. Poses are found by bases and directions: surfaces lie on each other in exact
+# poses only.
 POSES = Scales(across=0.223, along=0.028, stretch=0.226, turn=0.288, growth=0.262, grown=0.503, size=0.104,
-               spurt=0.296, loose=0.301, lines=0.0, near=1.0, parting=7.969)  # fmt: skip
+               spurt=0.296, loose=0.301, cloud=0.0, near=1.0, parting=7.969)  # fmt: skip
 LINKS = Scales(across=0.640, along=0.044, stretch=0.742, turn=0.420, growth=0.325, grown=0.1, size=0.112,
-               spurt=0.258, loose=0.270, lines=0.277, near=0.006, parting=13.222)  # fmt: skip
+               spurt=0.258, loose=0.270, cloud=0.684, near=0.023, parting=13.222)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +77,8 @@ class Differences:
         is_loose: only voxels show one of them.
         crowd: logarithm of the number of leaves.
         knows_up: of both dates.
-        near, far: mean distances between midribs, whichever way they run: the nearer and the farther way, from the one
-            to the other and back; None where nobody asked for them.
+        near: distances between surfaces, see `_cloud_distances`; None where nobody asked for them.
+        width: factor of the scales of places, in which `near` is measured, too.
     """
 
     across: Floats
@@ -94,17 +96,16 @@ class Differences:
     crowd: Floats
     knows_up: np.ndarray
     near: Floats | None
-    far: Floats | None
+    width: Floats
 
     @classmethod
-    def of(cls, pair: Pair, *, lines: bool) -> Differences:
-        """`lines`: with distances between midribs."""
+    def of(cls, pair: Pair, widths: Floats | None = None, *, cloud: bool = False) -> Differences:
+        """`widths` (N,) of the earlier leaves, 1 without; `cloud`: with distances between surfaces."""
         first, second, scale = pair.first, pair.second, pair.scale
         ends = first.midribs[:, [0, -1]].swapaxes(0, 1)  # (2, N, 3)
         apart = (second.bases - ends[:, :, None]) / scale
         lowest = ends[:, :, 2].min(1, initial=np.inf, keepdims=True)
         chords = np.stack([first.chords, -first.chords])
-        near, far = _line_distances(pair) if lines else (None, None)
         full = np.ones((len(first), len(second)))
         room = np.maximum(np.log(second.lengths.max(initial=1e-9) / first.lengths), 0)
         return cls(
@@ -117,43 +118,39 @@ class Differences:
             wider=0.5 * np.log(second.areas[None] / first.areas[:, None]),
             room=room[:, None] * full, days=pair.days * full,
             is_loose=~(first.is_surface[:, None] & second.is_surface[None]),
-            crowd=np.log(max(*full.shape, 1)) * full, knows_up=np.full(full.shape, pair.knows_up), near=near, far=far,
+            crowd=np.log(max(*full.shape, 1)) * full, knows_up=np.full(full.shape, pair.knows_up),
+            near=_cloud_distances(pair) if cloud else None, width=full if widths is None else widths[:, None] * full,
         )  # fmt: skip
 
 
-def fitted_costs(pair: Pair, scales: Scales = POSES) -> Floats:
+def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = None) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
-    likelier than not. What a person says of them counts, too."""
-    return costs_of(Differences.of(pair, lines=scales.lines > 0), scales) + pair.said
+    likelier than not. What a person says of them counts, too. `widths`: see `Differences`."""
+    return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.said
 
 
 def costs_of(found: Differences, scales: Scales) -> Floats:
     """(N, M) costs, see `fitted_costs`."""
     as_it_runs, turned = _place_costs(found, scales)
-    costs = np.minimum(as_it_runs, turned + BENT.flipped) + _size_costs(found, scales) + found.crowd - scales.parting
-    if found.near is None or found.far is None or not scales.lines:
-        return costs
-    lines = 0.5 * (student_tail(found.near / scales.near, 2) + student_tail(found.far / (3 * scales.near), 1))
-    return np.asarray(costs + scales.lines * lines)
+    costs = np.minimum(as_it_runs, turned + COSTS.flipped) + size_costs(found, scales) + found.crowd - scales.parting
+    if found.near is not None:
+        costs += scales.cloud * 0.5 * student_tail(found.near / (scales.near * found.width), 2)
+    return np.asarray(costs)
 
 
 def _place_costs(found: Differences, scales: Scales) -> Floats:
     """(2, N, M) of bases and directions. A base moves up the more the higher it is, as internodes below it stretch;
     where up is not known, as far in any direction."""
-    across = student_tail(found.across / np.hypot(scales.across, found.base_sd), 2)
-    along = student_tail(found.along / np.hypot(scales.along + scales.stretch * found.height, found.base_sd), 1)
-    away = student_tail(found.away / np.hypot(scales.across, found.base_sd), 3)
+    across = student_tail(found.across / np.hypot(scales.across * found.width, found.base_sd), 2)
+    up = (scales.along + scales.stretch * found.height) * found.width
+    along = student_tail(found.along / np.hypot(up, found.base_sd), 1)
+    away = student_tail(found.away / np.hypot(scales.across * found.width, found.base_sd), 3)
     turn = student_tail(found.turn / np.hypot(scales.turn, found.turn_sd), 2)
     return np.asarray(0.5 * (np.where(found.knows_up, across + along, away) + turn))
 
 
-def size_costs(pair: Pair, scales: Scales) -> Floats:
-    """(N, M) of sizes and shapes alone."""
-    return _size_costs(Differences.of(pair, lines=False), scales)
-
-
-def _size_costs(found: Differences, scales: Scales) -> Floats:
-    """Of sizes and shapes, which hardly change once a leaf has stopped growing.
+def size_costs(found: Differences, scales: Scales) -> Floats:
+    """(N, M) of sizes alone, which hardly change once a leaf has stopped growing.
 
     A size is the root of an area, or a length where one of the two leaves has no area. A leaf that grows has room to
     until it is as long as the longest one of the later date, and grows the faster the more it has, up to a factor of e.
@@ -168,13 +165,14 @@ def _size_costs(found: Differences, scales: Scales) -> Floats:
     return np.asarray(-np.logaddexp(stays, grows))
 
 
-def _line_distances(pair: Pair) -> tuple[Floats, Floats]:
-    """A leaf that is seen in part lies on the whole one, which reaches farther: the nearer way tells more."""
-    apart = np.linalg.norm(pair.first.midribs[:, None, :, None] - pair.second.midribs[None, :, None], axis=-1)
-    ways = apart.min(3).mean(2) / pair.scale, apart.min(2).mean(2) / pair.scale
-    return np.minimum(*ways), np.maximum(*ways)
+def _cloud_distances(pair: Pair) -> Floats:
+    """(N, M) mean distance of the points of one leaf from the other, the nearer way of two: a leaf that is seen in part
+    lies on the whole one."""
+    shape = (len(pair.first), SIGHTS.cloud, len(pair.second), SIGHTS.cloud)
+    apart = cdist(pair.first.points.reshape(-1, 3), pair.second.points.reshape(-1, 3)).reshape(shape)
+    return np.minimum(apart.min(3).mean(1), apart.min(1).mean(2)) / pair.scale
 
 
 def student_tail(x: Floats, dimensions: int) -> Floats:
     """Minus twice the log of Student's density in units of its peak."""
-    return (BENT.tail + dimensions) * np.log1p(np.square(x) / BENT.tail)
+    return (COSTS.tail + dimensions) * np.log1p(np.square(x) / COSTS.tail)

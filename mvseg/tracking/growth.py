@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
@@ -17,13 +17,13 @@ from scipy.special import expit
 
 from mvseg.system.running import kept
 from mvseg.tracking.dates import Floats, Number, PlantOnDate
-from mvseg.tracking.heights import level_heights
 from mvseg.tracking.numbers import GROWTH
 from mvseg.tracking.track import Tracks
 
 TRAITS = ("area", "length", "width", "inclination", "curvature", "insertion_height", "greenness_index")
 SIZES = ("area", "length", "width")  # get a curve, too
 NOTHING = Number(math.nan, math.nan, "")
+Heights = Mapping[int, Mapping[int, Number]]  # {track: {date: height of its base}}
 
 
 @dataclass(frozen=True)
@@ -136,6 +136,40 @@ def measure_growth(tracks: Tracks) -> Growth:
         if trait in SIZES and len(seen) >= GROWTH.least_dates:
             curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
+
+
+def level_heights(heights: Heights) -> tuple[dict[int, dict[int, Number]], dict[int, int]]:
+    """Level heights over one ground: those of the first date, and {date: its reference, a track}.
+
+    A date counts its heights from the lowest point of its own leaves, as nothing else of the plant is known there.
+    Where the lowest leaf falls, this ground rises, and all others seem to sink. So one leaf is the reference: its base
+    stays where it was on the first date, for the stem below a leaf that is open hardly stretches. Where it is gone,
+    another one that was seen with it takes over, at the height that it had then.
+
+    The reference is the leaf that the most dates from there on show; of several the lowest. The standard deviation of
+    its height is carried into those of the others. A date that shares no leaf with those before it has no heights.
+    """
+    level: dict[int, dict[int, Number]] = {track: {} for track in heights}
+    references: dict[int, int] = {}
+    for date in sorted({date for seen in heights.values() for date in seen}):
+        here = [track for track, seen in heights.items() if date in seen and (level[track] or not references)]
+        if not here:
+            continue
+        last = next(reversed(references.values()), None)
+        reference = last if last in here else min(here, key=lambda track: _rank(heights[track], date))
+        its = heights[reference][date]
+        known = next(reversed(level[reference].values()), its)
+        for track, seen in heights.items():
+            if date in seen:
+                own, sd = seen[date], seen[date].sd if not references else math.hypot(seen[date].sd, its.sd)
+                level[track][date] = replace(own, value=known.value + own.value - its.value, sd=sd)
+        level[reference][date], references[date] = known, reference
+    return level, references
+
+
+def _rank(seen: Mapping[int, Number], date: int) -> tuple[int, float]:
+    """The least one is shown by the most dates from this one on, and is low."""
+    return -sum(other >= date for other in seen), seen[date].value
 
 
 def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from mvseg.tracking.dates import Floats, PlantOnDate, SeenLeaf
-from mvseg.tracking.numbers import BENT, SIGHTS
+from mvseg.tracking.numbers import COSTS, SIGHTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ class Pair:
         for leaves in (first, second):
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
-                found += [float(np.median(leaves.lengths)), BENT.spread * float(np.sqrt(np.mean(spread**2)))]
+                found += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
         nothing = np.zeros((len(first), len(second)))
         return cls(first, second, days, knows_up, scale=max(found), said=nothing if said is None else said)
 

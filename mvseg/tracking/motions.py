@@ -13,8 +13,8 @@ import numpy as np
 
 from mvseg.system.running import kept
 from mvseg.tracking.align import alikeness, best_pairs, draw_poses, pose_distances, refine
-from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN, MOTIONS
 
@@ -49,7 +49,7 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     alike = alikeness(pair, poses)[:, : len(pair.first)]
     better = np.maximum(alike - alike[0], 0).sum(1)
     better[pose_distances(pair, pose, poses) < 1] = 0
-    costs = pair_costs(pair.moved(pose))
+    costs = fitted_costs(pair.moved(pose), LINKS)
     alone, found = _total(costs), []
     left = np.argsort(-better, kind="stable")
     for _ in range(ALIGN.num_refined):
@@ -59,7 +59,7 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
         left = left[pose_distances(pair, at, poses[left]) >= 1]
         refined = refine(pair.take(own, np.arange(len(pair.second))), at)
         if pose_distances(pair, pose, refined.pose[None])[0] >= 1:
-            others = pair_costs(pair.moved(refined.pose))
+            others = fitted_costs(pair.moved(refined.pose), LINKS)
             rows, columns = best_pairs(np.minimum(costs, others)).T
             keep = others[rows, columns] < costs[rows, columns]
             pairs = np.stack([rows[keep], columns[keep]], 1)

@@ -29,17 +29,16 @@ class SightNumbers:
 class AlignNumbers:
     """The pose of a plant on one date in the world of another."""
 
-    still: float = 5 / 6  # probability that a pot stands as it stood, before its plant is known
-    prior_pairs: int = 6  # pairs of dates that say as much as this does
+    still: float = 5 / 6  # chosen: probability that a pot stands as it stood, before its plant is known
+    prior_pairs: int = 6  # chosen: pairs of dates that say as much as this does
     least_still: float = 1e-6  # limit: probability of either answer, at least, so that its logarithm is a number
-    alike_length: float = 1.2  # difference of the log lengths of two leaves that suggest a pose, at most
-    num_refined: int = 20  # poses of two dates that are refined: those that look best
-    upright: float = 2.0  # weight of the direction of up where a pose is fitted, in leaves
-    tip: float = 0.43  # weight of the tip of a leaf there, where base and middle have 1, for tips sway
-    least_weight: float = 1.0  # weight there of a pair that a person says is one leaf, at least
-    large_new: float = 3.0  # log odds that each large leaf costs a pose that lets it appear from nowhere
-    temper: float = 0.44  # share of a gain of a pose that is log odds; `python benchmarks/fit_chances.py` fits it
-    told: float = 0.9  # probability of an alignment below which a person is told
+    num_refined: int = 20  # chosen: poses of two dates that are refined, those that look best
+    upright: float = 2.0  # chosen: weight of the direction of up where a pose is fitted, in leaves
+    tip: float = 0.43  # chosen: weight of the tip of a leaf there, where base and middle have 1, for tips sway
+    least_weight: float = 1.0  # chosen: min. weight there of a pair that the user says is one leaf
+    large_new: float = 3.0  # chosen: log odds that each large leaf costs a pose that lets it appear from nowhere
+    temper: float = 0.44  # fitted: python benchmarks/fit_chances.py; share of a gain of a pose that is log odds
+    told: float = 0.9  # chosen: probability of an alignment below which the user is told
     turns: int = 30  # definition: turns of a pot that leaves can tell apart, of 12 degrees
     rounds: int = 5  # limit: rounds of pairing leaves and fitting a pose to them, at most
     date_rounds: int = 6  # limit: rounds of placing all dates anew, at most; two or three are enough
@@ -51,34 +50,27 @@ class AlignNumbers:
 class MotionNumbers:
     """Two parts of a plant that have moved apart."""
 
-    least_gain: float = 20.0  # log odds from which a second motion is believed; leaves that only grow reach 15
-    sure_margin: float = 7.0  # log odds of it over each other one from which it is sure, where two turns fit
+    least_gain: float = 20.0  # chosen: log odds from which a second motion is believed
+    sure_margin: float = 7.0  # chosen: log odds of it over each other one from which it is sure, where two turns fit
 
 
 @dataclass(frozen=True)
-class BentNumbers:
-    """Costs of pairs of leaves, where a plant has bent, too."""
+class CostNumbers:
+    """Costs of pairs of leaves."""
 
-    tail: float = 3.0  # degrees of freedom of Student's t, which differences follow
-    flipped: float = 0.5  # additional cost of a midrib that runs the other way on the other date
-    spread: float = 0.6  # share of the spread of bases in which places are measured, if leaves are shorter
-    enough: int = 6  # leaves that are paired, from which on they tell how a plant bent
-    like_rigid: float = 0.3  # weight of one motion of all leaves, where a plant is bent, in leaves
-    place: float = 0.07  # scale of the distance of bases, or of points, of two sights of a leaf, in `Pair.scale`
-    rise: float = 0.02  # growth of that scale a day between the dates, for heights and points, as internodes stretch
-    bend: float = 0.10  # scale of the distance of midribs of two sights of a leaf, laid base on base, in its lengths
-    parting: float = 9.0  # log odds of a leaf against a stranger where midribs agree in all
-    apart: float = 3.0  # log odds of a leaf against a stranger where points lie on each other
-    cloud_counts: float = 0.3  # factor of the cost of midribs, or of points, whichever says less of a pair
-    in_part: float = 0.3  # difference of log lengths above which a surface may show a part of the leaf only
+    tail: float = 3.0  # chosen: degrees of freedom of Student's t, which differences follow
+    flipped: float = 0.5  # chosen: additional cost of a midrib that runs the other way on the other date
+    spread: float = 0.6  # chosen: share of the spread of bases in which places are measured, if leaves are shorter
+    prior_pairs: int = 3  # chosen: pairs that say as much of how a plant bent as the prior, that it did not
+    usual: float = 0.16  # chosen: usual error of the place of a base once a plant is bent, in `Pair.scale`
 
 
 @dataclass(frozen=True)
 class LinkNumbers:
     """Links from sight to sight of a leaf."""
 
-    most_gap: int = 3  # dates from one sight to another that are compared, at most, so that two may hide a leaf
-    unlinked: float = 2.0  # cost of a pair of leaves up to which one track is cheaper than two
+    most_gap: int = 3  # chosen: max. dates from one sight to another that are compared, so that two may hide a leaf
+    unlinked: float = 2.0  # chosen: cost of a pair of leaves up to which one track is cheaper than two
     said: float = 20.0  # definition: log odds of what a person says, where poses are weighed: more than any leaf's own
     asked: float = 1e4  # limit: gain of what a person says, above all that leaves can say
     most_odds: float = 40.0  # limit: log odds, at most, so that their exponentials are numbers
@@ -89,8 +81,8 @@ class LinkNumbers:
 class GrowthNumbers:
     """Curves of growing leaves."""
 
-    least_sd: float = 0.01  # standard deviation of a size, at least, as a share of it: no leaf is measured better
-    least_dates: int = 5  # dates on which a leaf is measured, from which on it gets a curve, which has three parameters
+    least_sd: float = 0.01  # chosen: min. standard deviation of a size, as a share of it: no leaf is measured better
+    least_dates: int = 5  # chosen: min. dates on which a leaf is measured for a curve, which has three parameters
 
 
 @dataclass(frozen=True)
@@ -98,7 +90,7 @@ class PageNumbers:
     """What a person sees and is asked."""
 
     most_questions: int = 10  # definition: questions that a person answers
-    least_doubt: float = 0.1  # probability that a link, or that there is none, is wrong, below which nobody is asked
+    least_doubt: float = 0.1  # chosen: probability that a link, or its absence, is wrong, below which nobody is asked
     curve_steps: int = 40  # definition: points of a drawn curve
     side: int = 72  # definition: pixels of a picture of a leaf
     large_side: int = 160  # definition: the same, where links are corrected
@@ -109,7 +101,7 @@ class PageNumbers:
 SIGHTS = SightNumbers()
 ALIGN = AlignNumbers()
 MOTIONS = MotionNumbers()
-BENT = BentNumbers()
+COSTS = CostNumbers()
 LINKING = LinkNumbers()
 GROWTH = GrowthNumbers()
 PAGE = PageNumbers()

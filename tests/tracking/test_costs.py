@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvseg.tracking.align import refine
-from mvseg.tracking.bent_costs import bent_costs, pair_costs
-from mvseg.tracking.fitted_costs import LINKS, fitted_costs, size_costs
+from mvseg.tracking.align import Alignment, best_pairs, refine
+from mvseg.tracking.bent_costs import bend, bent_costs
+from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, fitted_costs, size_costs
 from mvseg.tracking.leaves import Pair, leaves_of
+from mvseg.tracking.numbers import COSTS, LINKING, SIGHTS
 from tests.plants_over_days import Blades, grow_blades, see
 
 
@@ -35,8 +36,9 @@ def test_a_midrib_that_runs_the_other_way_costs_half_a_unit() -> None:
     pair, there = pair_of(grow_blades(7, 2), grow_blades(7, 2))
     turned = replace(pair, second=replace(pair.second, midribs=pair.second.midribs[:, ::-1]))
     rows = np.arange(7)
-    for costs in (pair_costs, lambda each: fitted_costs(each, LINKS)):
-        np.testing.assert_allclose((costs(turned) - costs(pair))[rows, there], 0.5, atol=1e-9)
+    for scales in (POSES, LINKS):
+        more = fitted_costs(turned, scales) - fitted_costs(pair, scales)
+        np.testing.assert_allclose(more[rows, there], 0.5, atol=1e-9)
 
 
 def test_a_plant_that_leans_over_is_bent_before_its_leaves_are_compared() -> None:
@@ -45,12 +47,58 @@ def test_a_plant_that_leans_over_is_bent_before_its_leaves_are_compared() -> Non
     leaning = {leaf: blade + (blade[0, 1, 2], 0.4 * blade[0, 1, 2], 0) for leaf, blade in blades.items()}
     pair, there = pair_of(blades, leaning)
     alignment = refine(pair, np.eye(4))
+    bent, straight = bent_costs(pair, alignment), fitted_costs(pair.moved(alignment.pose), LINKS)
     rows = np.arange(9)
-    bent, straight = bent_costs(pair, alignment), pair_costs(pair.moved(alignment.pose))
-    assert straight[rows, there].max() > 0
-    assert bent[rows, there].max() < -4
-    bent[rows, there] = np.inf
-    assert bent.min() > 0
+    assert bent[rows, there].max() < straight[rows, there].max() - 2
+    bent[rows, there] -= LINKING.unlinked
+    np.testing.assert_array_equal(best_pairs(bent), np.stack([rows, there], 1))
+
+
+def test_each_leaf_is_bent_as_the_pairs_of_the_others_say() -> None:
+    """As a loop that leaves its own pair out says, too; the prior is worth three pairs that did not move."""
+    pair, there = pair_of(grow_blades(9, 3), {leaf: blade + 0.2 * blade[0, 1, 2] for leaf, blade in
+                                              grow_blades(9, 3).items()})  # fmt: skip
+    rows = np.arange(7)
+    bent, widths = bend(pair, Alignment(np.eye(4), np.stack([rows, there[:7]], 1)))
+    bases, away = pair.first.bases / pair.scale, (pair.second.bases[there[:7]] - pair.first.bases[:7]) / pair.scale
+    places = np.column_stack([np.ones(9), bases - bases[:7].mean(0)])
+    weights = 1 / (1 + np.square(np.linalg.norm(away - np.median(away, 0), axis=1) / COSTS.usual))
+    shifts, variances = np.zeros((9, 3)), np.zeros(9)
+    for leaf in range(9):
+        covariance = COSTS.prior_pairs * np.eye(4)
+        moment = np.zeros((4, 3))
+        for other in rows:
+            if other != leaf:
+                covariance += weights[other] * np.outer(places[other], places[other])
+                moment += weights[other] * np.outer(places[other], away[other])
+        shifts[leaf] = places[leaf] @ np.linalg.inv(covariance) @ moment
+        variances[leaf] = places[leaf] @ np.linalg.inv(covariance) @ places[leaf]
+    np.testing.assert_allclose((bent.bases - pair.first.bases) / pair.scale, shifts, atol=1e-9)
+    median = np.median(np.linalg.norm((away - shifts[:7])[:, :2], axis=1)) / COSTS.usual
+    np.testing.assert_allclose(widths, np.sqrt((3 + 7 * median**2) / 10 * (1 + variances)))
+
+
+def test_few_pairs_hardly_move_the_costs_and_many_that_agree_narrow_them() -> None:
+    pair, there = pair_of(grow_blades(14, 1), grow_blades(14, 1))
+    widths = []
+    for count in (0, 1, 3, 14):
+        bent, width = bend(pair, Alignment(np.eye(4), np.stack([np.arange(count), there[:count]], 1)))
+        np.testing.assert_allclose(bent.bases, pair.first.bases, atol=1e-9)
+        widths.append(np.median(width))
+    assert widths[0] == 1
+    assert 0.7 < widths[2] < widths[1] < 1.2
+    assert widths[3] < 0.6
+    nothing = Alignment(np.eye(4), np.zeros((0, 2), int))
+    np.testing.assert_array_equal(bent_costs(pair, nothing), fitted_costs(pair, LINKS))
+
+
+def test_a_leaf_of_which_half_is_seen_lies_on_the_whole_one() -> None:
+    pair, there = pair_of(grow_blades(7, 2), grow_blades(7, 2))
+    half = pair.second.points[:, SIGHTS.cloud // 2 :].repeat(2, axis=1)
+    part = replace(pair, second=replace(pair.second, points=half))
+    near = Differences.of(part, cloud=True).near
+    assert near is not None
+    assert near[np.arange(7), there].max() < 0.03
 
 
 def test_a_leaf_that_has_stopped_growing_keeps_its_length_or_its_area_and_a_young_one_may_grow() -> None:
@@ -61,9 +109,10 @@ def test_a_leaf_that_has_stopped_growing_keeps_its_length_or_its_area_and_a_youn
     second = replace(pair.second, lengths=np.empty(4), areas=np.empty(4))
     second.lengths[there], second.areas[there] = after, (2000, 2000, 3600, 800)
     days = replace(pair, first=first, second=second, days=3)
-    costs = size_costs(days, LINKS)[rows, there]
+    costs = size_costs(Differences.of(days), LINKS)[rows, there]
     assert costs[[0, 2]].max() < 0.2
     assert 1 < costs[3] < 2.5  # it may have stopped early, which is rarer
     assert costs[1] < 2.5  # a surface shows it shorter, with the area that it had
     no_areas = replace(days, second=replace(second, areas=np.full(4, np.nan)))
-    assert size_costs(no_areas, LINKS)[rows, there][1] > costs[1] + 1  # then its length alone tells
+    lengths_alone = size_costs(Differences.of(no_areas), LINKS)[rows, there]
+    assert lengths_alone[1] > costs[1] + 1

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from mvseg.tracking.dates import Number, PlantOnDate
-from mvseg.tracking.growth import measure_growth, slope
-from mvseg.tracking.heights import level_heights
+from mvseg.tracking.growth import level_heights, measure_growth, slope
 from mvseg.tracking.track import TrackRow, Tracks
 from tests.plants_over_days import grow_blades, see
 
