@@ -33,8 +33,8 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import Plant
 from mvseg.regions import IGNORE_LABEL
 from mvseg.results.result import Result
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
@@ -53,12 +53,12 @@ class Case:
 
     Attributes:
         name: of its files.
-        known: what is known before edits.
+        plant: what is known before edits.
         truth: V label maps.
     """
 
     name: str
-    known: Known
+    plant: Plant
     truth: Sequence[Labels]
 
     @property
@@ -69,8 +69,8 @@ class Case:
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
     kept = None if cache is None else CachedDetections(cache)
-    known = find_in_photos(open_scene(folder, None, config), cache=kept)
-    return Case(f"detected_{folder.name}", known, true_maps(folder, known.scene))
+    plant = find_in_photos(open_scene(folder, None, config), cache=kept)
+    return Case(f"detected_{folder.name}", plant, true_maps(folder, plant.scene))
 
 
 def render(spec: SceneSpec, cache: Path) -> Path:
@@ -87,7 +87,7 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 
 def compute(case: Case, corrections: Corrections) -> Result:
     """What a run makes of the scene with these corrections, without traits."""
-    return shape_leaves(apply_edits(case.known, corrections))
+    return shape_leaves(apply_edits(case.plant, corrections))
 
 
 def correct(case: Case) -> tuple[list[tuple[int, float, float]], int]:

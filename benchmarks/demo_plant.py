@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.simulation.blades import Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.simulation.series import PotPlace, move_plant
 
@@ -39,7 +39,7 @@ def write_demo_plant_later(folder: Path) -> None:
     write_scene(folder, plant, cameras, seed=SEED)
 
 
-def grow_later(plant: Plant) -> Plant:
+def grow_later(plant: SimulatedPlant) -> SimulatedPlant:
     """The plant some days later: small leaves have grown, the lowest one has fallen, a new one (the next id) has
     unfolded at the tip of the stem, and the pot was turned, shifted and set down askew."""
     longest, tip = max(leaf.length for leaf in plant.leaves), plant.stems[0][-1]

@@ -17,7 +17,7 @@ def open_views(visible: np.ndarray) -> list[int]:
 
 def draw_from(case: Case, views: list[int], number: int) -> list[int]:
     """The first view, and then those from the most different sides."""
-    centers = case.known.scene.cameras.centers.numpy()
+    centers = case.plant.scene.cameras.centers.numpy()
     sights = centers - centers.mean(0)
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
     chosen = [views[0]]

@@ -24,7 +24,7 @@ from mvseg.formats.image_file import read_rgb
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.ray_cast import build_bvh, build_stage, merge_meshes, render_stage
 from mvseg.simulation.scene_writer import drop_small, write_jpeg
 from mvseg.system.atomic import write_whole
@@ -124,7 +124,7 @@ def load_detected(spec: SceneSpec, cache: Path) -> Regions:
         return Regions(**{name: torch.from_numpy(saved[name]) for name in names}, num_views=spec.num_views)
 
 
-def visible_ids(plant: Plant, cameras: Cameras) -> np.ndarray:
+def visible_ids(plant: SimulatedPlant, cameras: Cameras) -> np.ndarray:
     """(V, H, W) uint16 ids of the leaves, 0 elsewhere: one ray through each pixel's centre, and no light."""
     mesh = merge_meshes(plant)
     bvh = build_bvh(mesh)

@@ -39,9 +39,9 @@ from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import find_in_photos, know, look_once
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.known import Known
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import Plant
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
 APART = 0.02  # MV-PQ of two runs whose order counts, at least
@@ -62,9 +62,9 @@ def judge(masks: Masks, truth: list[Labels] | None) -> dict[str, str]:
     }
 
 
-def outline_some(known: Known, truth: list[Labels]) -> Corrections:
+def outline_some(plant: Plant, truth: list[Labels]) -> Corrections:
     """Six leaves, each in the two photos that show most of it: the largest that are not right, then the largest."""
-    look = Look(shape_leaves(known).masks.to("cpu"), truth, known.scene, ())
+    look = Look(shape_leaves(plant).masks.to("cpu"), truth, plant.scene, ())
     views_of = {leaf: open_views(look.visible[:, leaf]) for leaf in range(1, len(look.size))}
     seen = [leaf for leaf, views in views_of.items() if len(views) >= PHOTOS]
     chosen = sorted(seen, key=lambda leaf: (leaf in look.right, -float(look.size[leaf])))[:DRAWN]
@@ -72,11 +72,11 @@ def outline_some(known: Known, truth: list[Labels]) -> Corrections:
     return Corrections(tuple(look.outline(leaf, view) for leaf in chosen for view in best[leaf][:PHOTOS]))
 
 
-def show(name: str, known: Known, truth: list[Labels] | None, *, stays: str, begun: float) -> tuple[float, float]:
+def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, begun: float) -> tuple[float, float]:
     """Print a row; the agreed area and MV-PQ, NaN without a truth."""
-    area = 100 * known.agreed_area / int(known.scene.cameras.sizes.prod(1).sum())
+    area = 100 * plant.agreed_area / int(plant.scene.cameras.sizes.prod(1).sum())
     row: dict[str, Any] = {"": name, "agreed area": f"{area:.2f}", "stays": stays}
-    row |= judge(shape_leaves(known).masks.to("cpu"), truth) | {"CPU s": f"{time.process_time() - begun:.0f}"}
+    row |= judge(shape_leaves(plant).masks.to("cpu"), truth) | {"CPU s": f"{time.process_time() - begun:.0f}"}
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
     return area, float(row.get("MV-PQ", "nan"))
 
@@ -96,9 +96,9 @@ def see_next(folder: Path, weights: bytes | None, name: str, *, cache: CachedDet
         detect = DetectConfig() if weights is None else DetectConfig(weights=file.name)
         begun = time.process_time()
         opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off", detect=detect))
-        known = find_in_photos(opened, cache=cache)
+        plant = find_in_photos(opened, cache=cache)
     truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
-    show(name, known, truth, stays="", begun=begun)
+    show(name, plant, truth, stays="", begun=begun)
 
 
 def main() -> None:
@@ -119,11 +119,11 @@ def main() -> None:
         config = RunConfig(reconstruct=None, learn="off", detect=DetectConfig(image_size=args.image_size))
         opened, begun = open_scene(folder, None, config), time.process_time()
         cache = CachedDetections(args.cache / folder.resolve().name)
-        first = known = find_in_photos(opened, cache=cache)
+        first = plant = find_in_photos(opened, cache=cache)
         truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
-        print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {known.image_size} px\n")
+        print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {plant.image_size} px\n")
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
-        runs = [show("as it is", known, truth, stays="", begun=begun)]
+        runs = [show("as it is", plant, truth, stays="", begun=begun)]
         for size in args.sizes:
             begun, detect = time.process_time(), replace(config.detect, image_size=size)
             seen = know(opened, look_once(opened, detect, cache=cache, boxes=first.boxes))
@@ -132,19 +132,19 @@ def main() -> None:
             see_next(args.next, None, "the next plant", cache=cache)
         stays = True
         for number in range(1, args.rounds + 1):
-            begun, before = time.process_time(), known
-            known = learn(known, cache=cache, rounds=1)
-            stays = stays and known.agreed_area >= GROWTH * before.agreed_area
-            name = f"round {number}, at {known.image_size} px"
-            runs.append(show(name, known, truth, stays="yes" if stays else "no", begun=begun))
+            begun, before = time.process_time(), plant
+            plant = learn(plant, cache=cache, rounds=1)
+            stays = stays and plant.agreed_area >= GROWTH * before.agreed_area
+            name = f"round {number}, at {plant.image_size} px"
+            runs.append(show(name, plant, truth, stays="yes" if stays else "no", begun=begun))
             if args.next is not None:
-                see_next(args.next, known.learned.weights, f"the next plant, weights of round {number}", cache=cache)
+                see_next(args.next, plant.learned.weights, f"the next plant, weights of round {number}", cache=cache)
         if args.person and truth is not None:
             begun, corrections = time.process_time(), outline_some(first, truth)
-            known = learn(first, cache=cache, corrections=corrections, rounds=1)
-            show(f"{DRAWN} leaves of a person, learned", known, truth, stays="", begun=begun)
+            plant = learn(first, cache=cache, corrections=corrections, rounds=1)
+            show(f"{DRAWN} leaves of a person, learned", plant, truth, stays="", begun=begun)
             begun = time.process_time()
-            corrected = apply_edits(known, corrections)
+            corrected = apply_edits(plant, corrections)
             show("the same, and his masks", corrected, truth, stays="", begun=begun)
         ordered = [sum(pair) for pair in zip(ordered, count_ordered(runs), strict=True)]
     print(f"\nThe agreed area orders {ordered[0]} of {ordered[1]} pairs.")

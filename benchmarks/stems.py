@@ -35,7 +35,7 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.ray_cast import build_bvh, merge_meshes
 from mvseg.simulation.scene_writer import drop_small
 from mvseg.traits.nodes import measure_stem
@@ -110,7 +110,7 @@ def summarise(rows: list[dict[str, Any]]) -> str:
     return " | ".join(cells)
 
 
-def part_maps(plant: Plant, cameras: Cameras) -> list[np.ndarray]:
+def part_maps(plant: SimulatedPlant, cameras: Cameras) -> list[np.ndarray]:
     """V label maps of leaves, and after them of the stems, without petioles."""
     mesh, num = merge_meshes(plant), len(plant.leaves) + len(plant.stems)
     faces = [len(leaf.faces) for leaf in plant.leaves] + [len(part.faces) for part in plant.parts]

@@ -28,14 +28,14 @@ from mvseg.matching.match import match_regions
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 
 VIEWS, SIDE, TOP = 12, 10.0, 80.0  # views around; degrees of elevation
 SMALL = 200  # pixels
 FIRST_SEED = 7000  # of plants that are in no other set
 
 
-def strap_cameras(plant: Plant) -> Cameras:
+def strap_cameras(plant: SimulatedPlant) -> Cameras:
     around = arc_cameras(VIEWS, plant, span_deg=360, elevations_deg=(SIDE,))
     top = arc_cameras(1, plant, elevations_deg=(TOP,))
     parts = {name: torch.cat((getattr(around, name), getattr(top, name))) for name in ("K", "R", "t", "sizes")}

@@ -62,7 +62,7 @@ from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.split import split_merged
 from mvseg.matching.view_graph import ViewGraph
-from mvseg.pipeline.known import Known
+from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
@@ -234,11 +234,11 @@ def choose_found(args: argparse.Namespace) -> Iterator[Trial]:
     for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
         config = RunConfig(reconstruct=None)
         case = detect_case(folder, config, cache=args.cache / "kept" / folder.name)
-        first = choose_anew(case.known).to("cpu")
-        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, case.known), case.truth)
+        first = choose_anew(case.plant).to("cpu")
+        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, case.plant), case.truth)
         for number in (2, 3):
             drawn = draw(case, first, number)
-            yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, case.known, drawn), case.truth)
+            yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, case.plant, drawn), case.truth)
 
 
 TRIALS = {"given": check_given, "simulated": check_simulated, "found": choose_found}
@@ -256,19 +256,19 @@ def check_anew(masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Camer
     return split_merged(checked.close_gaps()).close_gaps()
 
 
-def choose_anew(known: Known) -> Masks:
-    sure, *more = known.matched
-    leaves = choose_leaves(sure, known.proposals, cameras=known.scene.cameras, more=more)
-    return snap_masks(leaves.masks, known.opened.photos)
+def choose_anew(plant: Plant) -> Masks:
+    sure, *more = plant.matched
+    leaves = choose_leaves(sure, plant.proposals, cameras=plant.scene.cameras, more=more)
+    return snap_masks(leaves.masks, plant.opened.photos)
 
 
-def follow_anew(known: Known, masks: Masks) -> Masks:
-    return follow_drawn(masks, cameras=known.scene.cameras, photos=known.opened.photos)[0]
+def follow_anew(plant: Plant, masks: Masks) -> Masks:
+    return follow_drawn(masks, cameras=plant.scene.cameras, photos=plant.opened.photos)[0]
 
 
 def draw(case: Case, first: Masks, number: int) -> Masks:
     """Every third leaf that enough photos show, up to `MOST_DRAWN`, was missed, and is drawn in so many of them."""
-    look, ids = Look(first, case.truth, case.known.scene, ()), first.instance_ids.clone()
+    look, ids = Look(first, case.truth, case.plant.scene, ()), first.instance_ids.clone()
     views = [(leaf, open_views(look.visible[:, leaf])) for leaf in range(1, len(look.size))]
     chosen = [(leaf, shown) for leaf, shown in views if len(shown) > number][number - 2 :: 3][:MOST_DRAWN]
     maps = [np.zeros_like(labels) for labels in case.truth]

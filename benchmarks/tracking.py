@@ -48,7 +48,7 @@ from mvseg.results.folder import save_result
 from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
 from mvseg.simulation.blades import BLADE_COLUMNS
-from mvseg.simulation.growth import Plant
+from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.series import (
     PotPlace,
     SeriesSpec,
@@ -72,7 +72,13 @@ Labels = list[list[int]]  # per date, one number per leaf: a track, or the true 
 
 
 def see_plant(
-    plant: Plant, time: float, rng: np.random.Generator, *, noise: float = 1.0, missed: float = 0.05, scene: str = "s"
+    plant: SimulatedPlant,
+    time: float,
+    rng: np.random.Generator,
+    *,
+    noise: float = 1.0,
+    missed: float = 0.05,
+    scene: str = "s",
 ) -> tuple[PlantOnDate, list[int]]:
     """A date as surfaces would show it: ends of midribs off by 3 % of the length, one base in 30 at the wrong end (of
     those that are not sure of it, one in three), some leaves missed. And the true ids of its leaves."""

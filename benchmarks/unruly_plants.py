@@ -24,7 +24,7 @@ from mvseg.formats.rig import write_rig
 from mvseg.scene import Scene, View
 from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import Floats
 from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.simulation.scene_writer import drop_small, shuffle_labels, write_jpeg
@@ -48,7 +48,7 @@ SWAY_DEG = 1.2  # from photo to photo: some 2 px at the tip of a leaf of 100 px
 POSE_PX = 1.5
 
 
-def make_unruly(plant: Plant, seed: int) -> Plant:
+def make_unruly(plant: SimulatedPlant, seed: int) -> SimulatedPlant:
     """A wild plant with curled and wavy blades."""
     rng = np.random.default_rng([seed, 3])
     return replace(make_wild(plant, seed), leaves=tuple(curl(leaf, rng) for leaf in make_wild(plant, seed).leaves))
@@ -64,7 +64,7 @@ def curl(leaf: Leaf, rng: np.random.Generator) -> Leaf:
     return replace(leaf_from_blade(leaf.leaf_id, waved), dryness=leaf.dryness)
 
 
-def sway(plant: Plant, rng: np.random.Generator) -> Plant:
+def sway(plant: SimulatedPlant, rng: np.random.Generator) -> SimulatedPlant:
     """The plant a moment later: every leaf turned a little around its base."""
     turns = [Rotation.from_rotvec(np.radians(rng.normal(0, SWAY_DEG, 3))) for _ in plant.leaves]
     moved = [

@@ -17,7 +17,7 @@ import pytest
 
 from mvseg.cli import main
 from mvseg.corrections.file import Corrections, name_edits
-from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.plant import Plant, match_given
 from mvseg.results.result import Learned
 from mvseg.server.correction_server import Corrector
 from mvseg.server.local_server import CorrectionServer
@@ -67,8 +67,8 @@ class Lesson:
             while not self.go_on.wait(0.02):
                 if is_old():
                     raise Cancelled
-            known, said = opened._known
-            opened.learned = replace(known, learned=Learned(weights=b"learned", rounds=1)), said
+            plant, said = opened._found
+            opened.learned = replace(plant, learned=Learned(weights=b"learned", rounds=1)), said
 
         monkeypatch.setattr(OpenResult, "learn", learn)
         monkeypatch.setattr(OpenResult, "can_learn", True)
@@ -80,12 +80,12 @@ class SlowLook:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.go_on = [threading.Event(), threading.Event()]
 
-        def look(opened: OpenResult) -> tuple[Known, list[str]]:
+        def look(opened: OpenResult) -> tuple[Plant, list[str]]:
             for go_on in progress_bar(self.go_on, "detection", unit="view"):
                 assert go_on.wait(WAIT)
             return match_given(opened.opened), []
 
-        monkeypatch.setattr(OpenResult, "_known", property(look))
+        monkeypatch.setattr(OpenResult, "_found", property(look))
         monkeypatch.setattr("mvseg.server.correction_server.STEP_SECONDS", 0.0)
 
 

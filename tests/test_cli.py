@@ -841,7 +841,7 @@ def test_a_repeated_warning_is_given_once(
             warn(Finding("one_number", "look here"))
         return match_masks(*args, **options)
 
-    monkeypatch.setattr("mvseg.pipeline.known.match_masks", warn_twice)
+    monkeypatch.setattr("mvseg.pipeline.plant.match_masks", warn_twice)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err.count("look here") == 1
     findings = json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["findings"]
@@ -928,7 +928,7 @@ def test_too_little_memory_is_one_sentence(
     def fail(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("mvseg.pipeline.known.match_masks", fail)
+    monkeypatch.setattr("mvseg.pipeline.plant.match_masks", fail)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert complaint(capsys).startswith("there is not enough memory")
 

@@ -34,7 +34,7 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.plant import Plant, match_given
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import regions_from_label_maps
@@ -181,12 +181,12 @@ def test_numbers_go_to_most_pixels_and_new_leaves_get_new_ones() -> None:
     def keep(masks: Masks) -> list[int]:
         instances = Instances(probabilities={int(id): float(id) for id in masks.instance_ids.unique() if id > 0})
         result = Result(scene=scene, matching=Matching(masks, MatchReport("test")), instances=instances)
-        kept = keep_numbers(result, known)
+        kept = keep_numbers(result, plant)
         for old, new in zip(masks.instance_ids.tolist(), kept.masks.instance_ids.tolist(), strict=True):
             assert old < 0 or kept.instances.probabilities[new] == old
         return kept.masks.instance_ids.tolist()
 
-    known: dict[str, int] = {}
+    plant: dict[str, int] = {}
     assert keep(first) == first.instance_ids.tolist()
     left = first.select(first.instance_ids != 1)
     assert keep(left.close_gaps()) == left.instance_ids.tolist()
@@ -257,11 +257,11 @@ def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pyt
     cut_off, more = (Finding("shape_cut_off", values={"count": count}) for count in (2, 3))
     opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"findings": (cut_off.as_json(),)}))
 
-    def shape(known: Known, **_: object) -> Result:
+    def shape(plant: Plant, **_: object) -> Result:
         warn(more)
         for photo in ("1", "2"):
             warn(Finding("dark_photo", photo))
-        return shape_leaves(known)
+        return shape_leaves(plant)
 
     monkeypatch.setattr("mvseg.server.open_result.shape_leaves", shape)
     assert opened.recompute(Corrections(), lambda: False)[2] == [
@@ -276,20 +276,20 @@ def test_it_opens_with_what_the_run_knew_before_edits(
     place, computed = tmp_path / "result", list[Any]()
     shutil.copytree(folder, place)
     monkeypatch.setattr(open_result, "match_given", lambda opened: computed.append(opened) or match_given(opened))
-    known, said = OpenResult(place)._known
+    plant, said = OpenResult(place)._found
     anew = match_given(OpenResult(place).opened)
     assert (computed, said) == ([], [])
-    assert torch.equal(known.masks.instance_ids, anew.masks.instance_ids)
-    assert torch.equal(known.masks.regions.crops, anew.masks.regions.crops)
-    assert known.disagreement == anew.disagreement
+    assert torch.equal(plant.masks.instance_ids, anew.masks.instance_ids)
+    assert torch.equal(plant.masks.regions.crops, anew.masks.regions.crops)
+    assert plant.disagreement == anew.disagreement
     with monkeypatch.context() as patch:
         patch.setattr(torch, "__version__", "0.0")
-        assert len(OpenResult(place)._known[0].masks) == len(known.masks)
+        assert len(OpenResult(place)._found[0].masks) == len(plant.masks)
     opened = OpenResult(place)
     opened._changes.append(Finding("input_changed", "masks"))
-    assert len(opened._known[0].masks) == len(known.masks)
+    assert len(opened._found[0].masks) == len(plant.masks)
     (place / BEFORE_EDITS_FILE).write_bytes(b"another")
-    assert len(OpenResult(place)._known[0].masks) == len(known.masks)
+    assert len(OpenResult(place)._found[0].masks) == len(plant.masks)
     assert len(computed) == 3
 
 

@@ -24,9 +24,9 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import learn as module
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.known import Known
 from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import Plant
 from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
 from mvseg.training.view_labels import ViewLabels
@@ -40,12 +40,12 @@ def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
     return write_leafy_scene(tmp_path_factory.mktemp("leafy"), num_leaves=4, num_views=4, size=SIZE, span_deg=180)
 
 
-SEEN: dict[tuple[float, int], Known] = {}  # by the scores and the number of leaves
+SEEN: dict[tuple[float, int], Plant] = {}  # by the scores and the number of leaves
 
 
 def see(
     leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, *, score: float = 0.2, leaves: int = 4, **options: Any
-) -> Known:
+) -> Plant:
     """Leaves that a detector has found with these scores; the views chose all of them, which is done once."""
     regions = leafy.regions.select(leafy.regions.labels <= leaves)
     ids = regions.labels
@@ -55,29 +55,29 @@ def see(
     see_masks(monkeypatch, replace(look, longest=SIZE))
     if (score, leaves) not in SEEN:
         SEEN[score, leaves] = find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None)))
-    known = SEEN[score, leaves]
-    return replace(known, opened=replace(known.opened, config=RunConfig(reconstruct=None, **options)))
+    plant = SEEN[score, leaves]
+    return replace(plant, opened=replace(plant.opened, config=RunConfig(reconstruct=None, **options)))
 
 
 def teach(monkeypatch: pytest.MonkeyPatch, *growth: float) -> list[ViewLabels]:
     """Each round makes the agreed area so many times as large as it was; the labels that were learned."""
     taught: list[ViewLabels] = []
 
-    def learn_once(known: Known, labels: ViewLabels, _: CachedDetections) -> Known:
+    def learn_once(plant: Plant, labels: ViewLabels, _: CachedDetections) -> Plant:
         taught.append(labels)
         grown = 0.5 * torch.tensor(growth[: len(taught)]).prod().sqrt()  # the area grows with the square of P
-        chances = {each: float(grown) for each in known.instances.probabilities}
-        seen = replace(known, instances=replace(known.instances, probabilities=chances))
+        chances = {each: float(grown) for each in plant.instances.probabilities}
+        seen = replace(plant, instances=replace(plant.instances, probabilities=chances))
         return replace(seen, learned=Learned(weights=f"weights {len(taught)}".encode()))
 
     monkeypatch.setattr(module, "_learn_once", learn_once)
     return taught
 
 
-def lower(known: Known, chance: float = 0.9) -> Known:
+def lower(plant: Plant, chance: float = 0.9) -> Plant:
     """So that the agreed area can grow."""
-    chances = dict.fromkeys(known.instances.probabilities, chance)
-    return replace(known, instances=replace(known.instances, probabilities=chances))
+    chances = dict.fromkeys(plant.instances.probabilities, chance)
+    return replace(plant, instances=replace(plant.instances, probabilities=chances))
 
 
 @pytest.mark.parametrize(
@@ -100,28 +100,28 @@ def test_weights_stay_where_the_agreed_area_grows(
     tried: int,
     kept: int,
 ) -> None:
-    known = lower(see(leafy, monkeypatch, learn=rounds), 0.5)
+    plant = lower(see(leafy, monkeypatch, learn=rounds), 0.5)
     taught = teach(monkeypatch, *growth)
-    seen = learn(known, cache=CachedDetections(tmp_path))
+    seen = learn(plant, cache=CachedDetections(tmp_path))
     assert len(taught) == tried
     assert seen.learned.rounds == kept
     assert seen.learned.weights == (f"weights {kept}".encode() if kept else None)
     assert len(seen.learned.agreed_area) == tried + 1
     assert seen.agreed_area == pytest.approx(max(seen.learned.agreed_area[: kept + 1]))
     if not kept:
-        assert torch.equal(seen.masks.instance_ids, known.masks.instance_ids)
+        assert torch.equal(seen.masks.instance_ids, plant.masks.instance_ids)
 
 
 def test_a_known_species_is_not_learned_unless_somebody_asks(
     leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     taught = teach(monkeypatch, 1.0)
-    known = see(leafy, monkeypatch, score=0.6)
-    assert learn(known, cache=CachedDetections(tmp_path)).learned == Learned(agreed_area=(known.agreed_area,))
+    plant = see(leafy, monkeypatch, score=0.6)
+    assert learn(plant, cache=CachedDetections(tmp_path)).learned == Learned(agreed_area=(plant.agreed_area,))
     assert not taught
     learn(see(leafy, monkeypatch, score=0.6, learn=1), cache=CachedDetections(tmp_path))
     assert len(taught) == 1
-    smaller = replace(known, image_size=round(SIZE * DETECTION.size_step))
+    smaller = replace(plant, image_size=round(SIZE * DETECTION.size_step))
     learn(smaller, cache=CachedDetections(tmp_path))
     assert len(taught) == 2  # the detector sees the leaves best at another size than its own
     with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):
@@ -134,32 +134,32 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
 def test_plants_that_the_shipped_detector_knows_are_not_learned(plant: str, shared_data: Path, tmp_path: Path) -> None:
     folder = demo_scene() if plant == "demo_plant" else shared_data / plant
     cache = CachedDetections(tmp_path)
-    known = find_in_photos(open_scene(folder, None, RunConfig(reconstruct=None)), cache=cache)
-    assert len(learn(known, cache=cache).learned.agreed_area) == 1
+    plant = find_in_photos(open_scene(folder, None, RunConfig(reconstruct=None)), cache=cache)
+    assert len(learn(plant, cache=cache).learned.agreed_area) == 1
 
 
 @pytest.mark.parametrize("reason", ["few", "interrupt", "fails"])
 def test_what_was_there_stays_and_one_sentence_says_why(
     leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reason: str
 ) -> None:
-    def stop(*_: object) -> Known:
+    def stop(*_: object) -> Plant:
         raise KeyboardInterrupt if reason == "interrupt" else InputError("it tells several kinds apart")
 
-    known = see(leafy, monkeypatch, leaves=2 if reason == "few" else 4, learn=2)
+    plant = see(leafy, monkeypatch, leaves=2 if reason == "few" else 4, learn=2)
     monkeypatch.setattr(module, "_learn_once", stop)
     codes = {"few": "learned_too_few", "interrupt": "learning_interrupted", "fails": "learning_failed"}
     with warns_of(codes[reason]):
-        seen = learn(known, cache=CachedDetections(tmp_path))
-    assert seen.agreed_area == known.agreed_area
+        seen = learn(plant, cache=CachedDetections(tmp_path))
+    assert seen.agreed_area == plant.agreed_area
     assert seen.learned.weights is None
 
 
 def test_what_a_person_says_is_learned(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    known = lower(see(leafy, monkeypatch, learn=1))
-    x1, y1, x2, y2 = known.masks.regions.boxes[0].tolist()
+    plant = lower(see(leafy, monkeypatch, learn=1))
+    x1, y1, x2, y2 = plant.masks.regions.boxes[0].tolist()
     edit = Reject(view=leafy.scene.views[0].name, at=((x1 + x2) / 2, (y1 + y2) / 2), everywhere=True)
     (without,) = (teach(monkeypatch, 1.0),)
-    learn(known, cache=CachedDetections(tmp_path), corrections=Corrections((edit,)))
+    learn(plant, cache=CachedDetections(tmp_path), corrections=Corrections((edit,)))
     assert [labels.num_leaves for labels in without] == [3]
 
 
@@ -168,7 +168,7 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
 ) -> None:
     """A run that was cut off goes on from the weights; the next plant can use them."""
     made: list[int] = []
-    known = see(leafy, monkeypatch, learn=1)
+    plant = see(leafy, monkeypatch, learn=1)
 
     def fine_tune(*_: object) -> bytes:
         made.append(1)
@@ -177,10 +177,10 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
     monkeypatch.setattr(module, "_fine_tune", fine_tune)
     monkeypatch.setattr(module, "_describe", lambda *_: "the same")
     monkeypatch.setattr(module, "_at_size", lambda path, _: path.read_bytes())
-    monkeypatch.setattr(module, "look_near", lambda *_, **__: known)
-    monkeypatch.setattr(module, "know", lambda *_, **__: known)
+    monkeypatch.setattr(module, "look_near", lambda *_, **__: plant)
+    monkeypatch.setattr(module, "know", lambda *_, **__: plant)
     for _ in range(2):
-        seen = learn(lower(known, 0.5), cache=CachedDetections(tmp_path / "kept"))
+        seen = learn(lower(plant, 0.5), cache=CachedDetections(tmp_path / "kept"))
         assert seen.learned.weights == b"weights"
     assert len(made) == 1
     save_result(shape_leaves(seen), tmp_path / "out", report=False)

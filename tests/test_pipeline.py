@@ -40,9 +40,9 @@ from mvseg.formats.scene_folder import read_masks
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.pipeline.finish import finish, shape_leaves
-from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import Plant, match_given
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
@@ -228,12 +228,12 @@ class TestDescribeRun:
         rig, first = plant / "cameras.json", plant / "masks" / "000.png"
         inputs = {str(path): hash_files(path) for path in (rig, plant / "masks")}
 
-        def change(known: Known, **_: object) -> Result:
+        def change(known: Plant, **options: Any) -> Result:
             for path in (rig, first):
                 path.write_bytes(path.read_bytes() + b"\n")
-            return finish(known)
+            return shape_leaves(known, **options)
 
-        monkeypatch.setattr(mvseg.pipeline.run_scene, "finish", change)
+        monkeypatch.setattr(mvseg.pipeline.run_scene, "shape_leaves", change)
         result = run_scene(plant, plant / "masks", IDS_ONLY)
         assert describe_run(result, plant / "masks", IDS_ONLY)["inputs"] == inputs
 
@@ -302,7 +302,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
 
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.pipeline.known.match_masks", match)
+    monkeypatch.setattr("mvseg.pipeline.plant.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     ids = result.matching.instance_ids.tolist()

@@ -16,30 +16,30 @@ from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.matching.match import match_masks
-from mvseg.pipeline.known import Known
+from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
 from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
 
 
-def apply_edits(known: Known, corrections: Corrections | None) -> Known:
+def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     """What a person says changes masks and links them, and these are matched anew, see `mvseg.corrections.apply`.
 
-    Edits are about masks that a person sees, see `Known.shown`. Without any edits, all stays as it is. The reprojection
+    Edits are about masks that a person sees, see `Plant.shown`. Without any edits, all stays as it is. The reprojection
     error is that of the masks before edits, unless a person drew more than half as many as there were.
     """
     if corrections is None or not corrections.edits:
-        return known
-    opened, cameras, config = known.opened, known.scene.cameras, known.opened.config
+        return plant
+    opened, cameras, config = plant.opened, plant.scene.cameras, plant.opened.config
     with timed("correct"):
-        shown, before = known.shown, known.masks.to("cpu")
-        corrected = apply(corrections, shown, known.scene)
+        shown, before = plant.shown, plant.masks.to("cpu")
+        corrected = apply(corrections, shown, plant.scene)
         corrected = link_halves(corrected, before, cameras.to("cpu"))
         seen = seen_ids(corrected.masks, before) if opened.is_chosen else torch.full_like(corrected.last_edits, -1)
         seen = seen.where(torch.isin(seen, leaves_as_seen(corrected, seen, before)), -1)
     with timed("match"):
-        matched, seen = _match_anew(known, corrected, seen)
+        matched, seen = _match_anew(plant, corrected, seen)
     masks, corrected = apply_everywhere(corrected, matched.masks)
     if len(shown) and not len(masks):
         warn(Finding("no_leaf_left"))
@@ -49,37 +49,37 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
     if opened.is_chosen or config.reconstruct is not None:
         with timed("follow"):
             photos = opened.photos if opened.photos.exist else None
-            colors = known.leaf_colors if photos is not None and known.matching.num_instances else None
+            colors = plant.leaf_colors if photos is not None and plant.matching.num_instances else None
             masks, starts = follow_drawn(
                 edited.masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces
             )
             edited = replace(edited, instances=Instances(starts=starts)).with_masks(masks)
-    edited = edited.cut_merged()
+    edited = edited if opened.is_checked else edited.cut_merged()
     if not opened.is_chosen:
         return edited
     with timed("choose"):
         masks = edited.masks.to("cpu")
         leaves = choose_leaves(
             masks,
-            known.proposals,
+            plant.proposals,
             cameras=cameras,
-            more=known.matched,
+            more=plant.matched,
             gone=_taken_away(shown, masks),
             seen=seen_ids(masks, replace(corrected.masks, instance_ids=seen)),
-            drawn=known.drawn,
+            drawn=plant.drawn,
             min_probability=config.detect.min_probability,
             cache=opened.surfaces,
         )
     return edited.with_leaves(leaves)
 
 
-def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Known, Tensor]:
+def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant, Tensor]:
     """Match the edited masks anew, but for those of leaves that stay: these keep their ids.
 
     Where the views choose, and a person speaks of such leaves only, nothing is matched, and what matching said stays.
 
     Args:
-        known: before the edits.
+        plant: before the edits.
         corrected: D masks and their links.
         seen: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
 
@@ -88,23 +88,23 @@ def _match_anew(known: Known, corrected: Corrected, seen: Tensor) -> tuple[Known
     """
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
-    if known.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
+    if plant.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
         ids_only = replace(masks, instance_ids=seen).close_gaps()
-        return replace(known, matching=known.matching.with_masks(ids_only)), seen
-    is_known = 2 * int(masks.is_corrected.sum()) <= len(known.masks)  # else his masks tell it better
+        return replace(plant, matching=plant.matching.with_masks(ids_only)), seen
+    is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else his masks tell it better
     matching = match_masks(
         masks,
-        known.scene.cameras,
-        known.opened.config.match,
+        plant.scene.cameras,
+        plant.opened.config.match,
         links=corrected.links,
-        residual_px=known.matching.report.residual_px if is_known else None,
+        residual_px=plant.matching.report.residual_px if is_known else None,
     )
     matched = matching.masks.to("cpu")
     seen = leave_joined(seen, matched.instance_ids, is_held)
     ids = torch.where(seen > 0, seen + matched.num_instances, matched.instance_ids)
-    disagreement = known.opened.find_disagreement(matching)
+    disagreement = plant.opened.find_disagreement(matching)
     matching = matching.with_masks(replace(matched, instance_ids=ids).close_gaps())
-    return replace(known, matching=matching, disagreement=disagreement), seen
+    return replace(plant, matching=matching, disagreement=disagreement), seen
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:

@@ -17,8 +17,8 @@ import torch
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
+from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache
 from mvseg.regions import Regions
@@ -42,15 +42,15 @@ CLASSES: list[Any] = [
 ]
 
 
-def pack_known(known: Known, said: Sequence[Finding]) -> bytes | None:
+def pack_plant(plant: Plant, said: Sequence[Finding]) -> bytes | None:
     """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`). None where it is
     too much to be read again."""
     packed = io.BytesIO()
-    opened = known.opened
+    opened = plant.opened
     torch.save(
         {
             "views": opened.names,
-            "known": {name: getattr(known, name) for name in FIELDS},
+            "plant": {name: getattr(plant, name) for name in FIELDS},
             "approaches": opened.surfaces.approaches,
             "surfaces": opened.surfaces.surfaces,
             "snapped": {name: torch.from_numpy(each) for name, each in opened.snapped.items()},
@@ -61,8 +61,8 @@ def pack_known(known: Known, said: Sequence[Finding]) -> bytes | None:
     return zlib.compress(packed.getvalue(), 1) if packed.tell() <= MOST_BYTES else None
 
 
-def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[Finding]] | None:
-    """What `pack_known` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
+def unpack_plant(content: bytes, opened: Opened) -> tuple[Plant, list[Finding]] | None:
+    """What `pack_plant` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
 
     None: it is of other views, or something else.
     """
@@ -77,6 +77,6 @@ def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[Finding]] 
         surfaces = SurfaceCache(packed["approaches"], packed["surfaces"])
         snapped = {name: each.numpy() for name, each in packed["snapped"].items()}
         opened = replace(opened, surfaces=surfaces, snapped=snapped)
-        return Known(opened=opened, **packed["known"]), packed["said"]
+        return Plant(opened=opened, **packed["plant"]), packed["said"]
     except Exception:  # zlib and torch raise many kinds at broken files
         return None

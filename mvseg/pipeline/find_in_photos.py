@@ -17,13 +17,13 @@ from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.matching.result import Matching
-from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
+from mvseg.pipeline.plant import Plant, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.results.result import Instances
 
 
-def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Known:
+def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Plant:
     """Look for leaves in the photos; the views choose leaves and masks.
 
     The detector looks at several sizes, unless one is given: see `choose_size`. With twice as many photos as
@@ -67,19 +67,18 @@ def _thin(opened: Opened) -> tuple[Opened, Tensor]:
     return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
 
 
-def look_near(known: Known, detect: DetectConfig, *, cache: CachedDetections | None) -> Found:
-    """What weights find that have learned at the size of what is known: there, or at the size next to it where the
+def look_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | None) -> Found:
+    """What weights find that have learned at the size of this look: there, or at the size next to it where the
     views agree better, see `choose_near`; there alone where a size is given."""
-    opened, boxes = known.opened, known.boxes
+    opened, boxes = plant.opened, plant.boxes
     few, views = _thin(opened)
     if detect.image_size is not None:
         return look_once(opened, detect, cache=cache, boxes=boxes)
 
     def see(size: int) -> Found:
-        part = None if boxes is None else boxes[views]
-        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=part)
+        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views])
 
-    found = choose_near(see, known.image_size, most=known.longest_side)
+    found = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
         return found
     return look_once(opened, replace(detect, image_size=found.looks[0].longest), cache=cache, boxes=boxes)
@@ -110,22 +109,22 @@ def _choose(opened: Opened, look: Look, detect: DetectConfig) -> Found:
     return find_leaves([look], opened.scene.cameras, config=detect, splits=opened.is_cut, cache=opened.surfaces)
 
 
-def know(opened: Opened, found: Found) -> Known:
+def know(opened: Opened, found: Found) -> Plant:
     """What is known once a look is chosen; warns of what there is to say of it."""
     for finding in found.said:
         warn(finding)
     if not len(found.looks[0].sure):
         warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
     matching = Matching(found.matched[0], found.report)
-    known = Known(
+    plant = Plant(
         opened=opened,
         matching=matching,
         instances=Instances(),
         proposals=found.proposals,
         matched=found.matched,
         image_size=found.looks[0].longest,
-        boxes=found.looks[0].boxes,
+        boxes=whole_photos(opened.scene) if found.looks[0].boxes is None else found.looks[0].boxes,
         left=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return known.with_leaves(found.leaves) if opened.is_chosen else known
+    return plant.with_leaves(found.leaves) if opened.is_chosen else plant

@@ -15,12 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from mvseg._version import code_hash
 from mvseg.corrections.file import Corrections
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.config import DetectConfig
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
@@ -29,7 +27,7 @@ from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import know, look_near
 from mvseg.pipeline.finish import complete_masks
-from mvseg.pipeline.known import Known
+from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
@@ -45,8 +43,8 @@ GROWTH = 1.1
 
 
 def learn(
-    known: Known, *, cache: CachedDetections, corrections: Corrections | None = None, rounds: int | None = None
-) -> Known:
+    plant: Plant, *, cache: CachedDetections, corrections: Corrections | None = None, rounds: int | None = None
+) -> Plant:
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
     A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
@@ -55,7 +53,7 @@ def learn(
     when it grows by less than `GROWTH`. Ctrl-C ends them, too, and what was there stays.
 
     Args:
-        known: of leaves that the views chose.
+        plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of a person; his masks are certain.
         rounds: that a person asks for, who judges himself: so many are learned, and the last weights stay. None: as
@@ -64,14 +62,14 @@ def learn(
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
-    best, areas = known, [known.agreed_area]
+    best, areas = plant, [plant.agreed_area]
     try:
-        for number in range(1, (_count_rounds(known) if rounds is None else rounds) + 1):
+        for number in range(1, (_count_rounds(plant) if rounds is None else rounds) + 1):
             with collect_warnings():  # what there is to say of edits, is said when they are applied
                 edited = apply_edits(best, corrections)
             chances = edited.instances.probabilities
-            photos = known.opened.photos
-            labels = label_views(complete_masks(edited), best.proposals, photos, probabilities=chances)
+            photos = plant.opened.photos
+            labels = label_views(complete_masks(edited).masks, best.proposals, photos, probabilities=chances)
             if not labels.are_enough:
                 warn(Finding("learned_too_few", values={"count": labels.num_leaves, "least": LEAST_LEAVES}))
                 break
@@ -91,42 +89,39 @@ def learn(
     return replace(best, learned=replace(best.learned, agreed_area=tuple(areas)))
 
 
-def _count_rounds(known: Known) -> int:
+def _count_rounds(plant: Plant) -> int:
     """How many rounds to try; with "auto", none where the detector knows the species: it is sure of most leaves, and
     sees them best at its own size."""
-    opened = known.opened
+    opened = plant.opened
     if not opened.is_chosen or opened.config.learn == "off":
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    is_known = is_familiar(known.masks, sure_score=DETECTION.sure_score) and not _is_smaller(known)
+    is_known = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not _is_smaller(plant)
     return 0 if is_known else ROUNDS
 
 
-def _is_smaller(known: Known) -> bool:
+def _is_smaller(plant: Plant) -> bool:
     """Whether the views chose a smaller size than the one that the detector begins with, see `choose_size`."""
-    detect = known.opened.config.detect
+    detect = plant.opened.config.detect
     _, description = read_weights(weights_path(detect.weights))
     if detect.image_size is not None or description is None:
         return False
-    own = min(description.image_size, known.longest_side)
-    return known.image_size < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
+    own = min(description.image_size, plant.longest_side)
+    return plant.image_size < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
 
 
-def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Known:
+def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Plant:
     """The scene, seen with the weights that the run began with once they have learned these labels."""
-    opened, boxes = known.opened, known.boxes
-    if boxes is None:
-        sizes = opened.scene.cameras.sizes
-        boxes = torch.cat((torch.zeros_like(sizes), sizes), 1)
-    path = cache.learned(_describe(opened.config.detect, known.image_size, labels, boxes))
+    opened = plant.opened
+    path = cache.learned(_describe(plant, labels))
     if not path.is_file():
         with timed("learn"):
-            content = _fine_tune(opened.config.detect, known, labels, boxes)
+            content = _fine_tune(plant, labels)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
-    found = look_near(known, detect, cache=cache)
+    found = look_near(plant, detect, cache=cache)
     with collect_warnings():
         seen = know(opened, found)
     return replace(seen, learned=Learned(weights=_at_size(path, seen.image_size)))
@@ -139,32 +134,33 @@ def _at_size(path: Path, size: int) -> bytes:
     return encode_weights(weights, replace(description, image_size=size))
 
 
-def _fine_tune(detect: DetectConfig, known: Known, labels: ViewLabels, boxes: Tensor) -> bytes:
+def _fine_tune(plant: Plant, labels: ViewLabels) -> bytes:
     """The content of a file of weights that have learned the labels, at the size of the look that they come from."""
+    detect = plant.opened.config.detect
     _, description = read_weights(weights_path(detect.weights))
     if description is None or len(description.categories) != 1:
         raise InputError(f"{detect.weights} tells several kinds of objects apart, expected a detector of leaves alone")
-    detector = load_detector(detect.weights, image_size=known.image_size).to(_device())
-    learned = fine_tune(detector, known.opened.photos, labels, boxes=boxes)
+    detector = load_detector(detect.weights, image_size=plant.image_size).to(_device())
+    learned = fine_tune(detector, plant.opened.photos, labels, boxes=plant.boxes)
     halves = {name: each.half() if each.is_floating_point() else each for name, each in learned.state_dict().items()}
-    return encode_weights(halves, replace(description, image_size=known.image_size))
+    return encode_weights(halves, replace(description, image_size=plant.image_size))
 
 
 def _device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _describe(detect: DetectConfig, image_size: int, labels: ViewLabels, boxes: Tensor) -> str:
+def _describe(plant: Plant, labels: ViewLabels) -> str:
     """All that learned weights depend on."""
     shown = [each.regions for each in (labels.leaves, labels.doubtful)]
-    tensors = [boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
+    tensors = [plant.boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
     digest = hashlib.sha256(b"".join(each.cpu().numpy().tobytes() for each in tensors))
     digest.update(np.ascontiguousarray(labels.colors).tobytes())
     return json.dumps(
         {
-            "weights": hash_files(Path(weights_path(detect.weights))),
+            "weights": hash_files(Path(weights_path(plant.opened.config.detect.weights))),
             "labels": digest.hexdigest(),
-            "size": image_size,
+            "size": plant.image_size,
             "steps": STEPS,
             "code": code_hash(),
             "torch": torch.__version__,

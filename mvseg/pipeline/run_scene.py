@@ -1,7 +1,7 @@
 """The whole method on a page: from a scene's folder to the same id for a leaf in every view, and its shape.
 
 Everybody calls these lines: `mvseg infer` and `mvseg batch` call `run_scene`, and the page that a person corrects keeps
-one `Known`, and calls those that follow it.
+one `Plant`, and calls those that follow it.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.errors import check_arguments, collect_warnings, note_warnings
 from mvseg.findings.finding import keep_causes
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import pack_known
-from mvseg.pipeline.finish import finish, shape_leaves
-from mvseg.pipeline.known import match_given
+from mvseg.pipeline.before_edits import pack_plant
+from mvseg.pipeline.finish import check_result, measure, shape_leaves
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import match_given
 from mvseg.results.result import Result
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
@@ -64,21 +64,23 @@ def run_scene(
             check_made_for(corrections, opened.photos)
         with note_warnings() as said:
             if opened.given is not None:
-                known = match_given(opened)
+                plant = match_given(opened)
             else:
                 from mvseg.pipeline.find_in_photos import find_in_photos  # loads torchvision
                 from mvseg.pipeline.learn import learn
 
                 kept = CachedDetections(Path(cache or place))
-                known = find_in_photos(opened, cache=kept)
-                known = learn(known, cache=kept, corrections=corrections)
+                plant = find_in_photos(opened, cache=kept)
+                plant = learn(plant, cache=kept, corrections=corrections)
                 kept.delete_others()
-        edited, before = apply_edits(known, corrections), None
+        edited, before = apply_edits(plant, corrections), None
         if edited.edits:
             with collect_warnings():  # of masks that nobody sees any more
-                before = shape_leaves(known).surfaces
-        result = finish(edited, same_segmenter=before)
-        packed = pack_known(known, said)
+                before = shape_leaves(plant).surfaces
+        result = shape_leaves(edited, same_segmenter=before)
+        result = check_result(result, edited)
+        result = measure(result, config)
+        packed = pack_plant(plant, said)
     inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
     findings = keep_causes((*noticed, *result.findings))
     result = replace(result, findings=findings, corrections=corrections, before_edits=packed)

@@ -110,7 +110,7 @@ class Result:
         corrections: of a person; None where there were none.
         fates: the outcome of each of them.
         learned: by the detector from this scene.
-        before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_known`); None: nothing is kept.
+        before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_plant`); None: nothing is kept.
         inputs: {path: SHA-256} of the cameras, masks, weights and corrections, as the run read them.
         run: that made a result which was loaded from its folder; None before it was saved.
     """

@@ -1,4 +1,4 @@
-"""A result that a person corrects: what is known without him is found once, and each edit reruns only what follows."""
+"""A result that the user corrects: the plant is found once, and each edit runs again only what follows."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import unpack_known
+from mvseg.pipeline.before_edits import unpack_plant
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.known import Known, match_given
 from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import Plant, match_given
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import stack_regions
 from mvseg.results.folder import BEFORE_EDITS_FILE
@@ -93,8 +93,8 @@ class OpenResult:
         self.answers = {"outline": self.outline}
         self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
-        self._before: tuple[Known, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
-        self.learned: tuple[Known, list[Finding]] | None = None  # what is known since the detector learned the plant
+        self._before: tuple[Plant, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
+        self.learned: tuple[Plant, list[Finding]] | None = None  # since the detector learned the plant
 
     @property
     def can_learn(self) -> bool:
@@ -147,7 +147,7 @@ class OpenResult:
         self._shown = shown, pictures
         yield Update(news, outcomes, vanished + messages)
         if self.opened.is_chosen:
-            self._now_known[0].draw_ahead()
+            self._now[0].draw_ahead()
 
     @cached_property
     def _shown(self) -> tuple[Result, list[Picture]]:
@@ -186,10 +186,10 @@ class OpenResult:
             Cancelled: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        known, noticed = self._now_known
+        plant, noticed = self._now
         with running(is_cancelled=is_old), collect_warnings() as more:
-            edited = apply_edits(known, corrections)
-            result = shape_leaves(edited, same_segmenter=self._fit_before(known) if edited.edits else None)
+            edited = apply_edits(plant, corrections)
+            result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
         told = {"edit", *(each.get("code") for each in self.run.said.findings)}
         new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
@@ -211,7 +211,7 @@ class OpenResult:
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
         with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
-            learned = learn(self._known[0], cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
+            learned = learn(self._found[0], cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
         if learned.learned.weights is None:
             raise InputError(" ".join(map(as_sentence, said)))
         self.learned = learned, said
@@ -257,24 +257,24 @@ class OpenResult:
         return {"polygon": np.round(placed, 2).tolist()}
 
     @property
-    def _now_known(self) -> tuple[Known, list[Finding]]:
-        return self._known if self.learned is None else self.learned
+    def _now(self) -> tuple[Plant, list[Finding]]:
+        return self._found if self.learned is None else self.learned
 
     @cached_property
-    def _known(self) -> tuple[Known, list[Finding]]:
-        """What is known without a person, and the findings on the way; it stays."""
-        before = None if (content := self._before_edits()) is None else unpack_known(content, self.opened)
+    def _found(self) -> tuple[Plant, list[Finding]]:
+        """The plant before edits, and the findings on the way; found once."""
+        before = None if (content := self._before_edits()) is None else unpack_plant(content, self.opened)
         if before is not None:
             return before
         with collect_warnings() as noticed:
-            known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
-        return known, noticed
+            plant = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
+        return plant, noticed
 
-    def _fit_before(self, known: Known) -> Mapping[int, LeafSurface] | None:
+    def _fit_before(self, plant: Plant) -> Mapping[int, LeafSurface] | None:
         """The surfaces before edits, which tell how the masks err."""
-        if self._before is None or self._before[0] is not known:
+        if self._before is None or self._before[0] is not plant:
             with collect_warnings():
-                self._before = known, shape_leaves(known).surfaces
+                self._before = plant, shape_leaves(plant).surfaces
         return self._before[1]
 
     def _before_edits(self) -> bytes | None:

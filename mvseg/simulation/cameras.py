@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
-from mvseg.simulation.growth import Plant
+from mvseg.simulation.growth import SimulatedPlant
 
 FRAME_FILL = 0.94  # share of the half image that the farthest point of the plant reaches
 DISTANCE = 3.5  # from the cameras to the plant's centre, in radii of the plant
@@ -18,7 +18,7 @@ DISTANCE = 3.5  # from the cameras to the plant's centre, in radii of the plant
 
 def arc_cameras(
     num_views: int,
-    plant: Plant,
+    plant: SimulatedPlant,
     *,
     span_deg: float = 200.0,
     start_deg: float = 0.0,

@@ -18,7 +18,7 @@ from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.simulation.wild import make_wild
 from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole, write_whole
@@ -183,7 +183,7 @@ def finish_scene(dataset: Path, preset: Preset, scene: SceneSpec) -> list[Photo]
     return [annotate_photo(dataset, name, preset.size) for name in names]
 
 
-def scene_cameras(scene: SceneSpec, plant: Plant, preset: Preset) -> Cameras:
+def scene_cameras(scene: SceneSpec, plant: SimulatedPlant, preset: Preset) -> Cameras:
     """The arc of the evaluation, or cameras all around, at heights and with a zoom drawn for the scene."""
     rng = np.random.default_rng([scene.seed, *b"cameras"])  # not the numbers that the look is drawn from
     width, height = preset.size

@@ -27,7 +27,7 @@ FAR_AWAY = np.array([[0.0, 0.0, -1e6]])  # a point that crowds nothing
 
 
 @dataclass(frozen=True, eq=False)
-class Plant:
+class SimulatedPlant:
     """A grown plant: its leaves in the order of their ids 1..len(leaves), and everything else that a camera sees.
 
     Attributes:
@@ -72,7 +72,7 @@ class Frond:
         return np.concatenate([blade[::2] for blade in self.blades])
 
 
-def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
+def grow_plant(family: str, num_leaves: int, seed: int) -> SimulatedPlant:
     """Grow a plant; the same arguments give the same plant, bit for bit.
 
     Args:
@@ -110,7 +110,7 @@ def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
         tubes.append(make_tube("stake", np.linspace(foot, top, 8), radius=rng.uniform(1.5, 4), taper=1.0))
     petioles = tuple(frond.rachis for frond in fronds for _ in frond.blades)
     parts = (*tubes, *pot_parts(pot, rng))
-    return Plant(family=family, leaves=leaves, parts=parts, stems=tuple(stems), petioles=petioles)
+    return SimulatedPlant(family=family, leaves=leaves, parts=parts, stems=tuple(stems), petioles=petioles)
 
 
 # --- fronds

@@ -20,7 +20,7 @@ from skimage.segmentation import find_boundaries
 
 from mvseg.scene import Cameras
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import Plant
+from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.look import Floats, Look, draw_look, draw_wild_look
 from mvseg.simulation.shading import GROUND, MATERIALS, Hits, backdrop_color, develop, dot, shade, unit
 
@@ -75,8 +75,8 @@ class Stage:
 
 
 def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
-    """Photograph a plant with one of V cameras, in the world units of `Plant`; ids and depth do not depend on the seed
-    of the stage."""
+    """Photograph a plant with one of V cameras, in the world units of the plant; ids and depth do not depend on the
+    seed of the stage."""
     K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
     width, height = cameras.sizes[view].tolist()
     center, world_from_px = (-R.T @ t).astype(np.float32), R.T @ np.linalg.inv(K)
@@ -142,7 +142,7 @@ def gather_sunlight(stage: Stage, points: Floats, face_normal: Floats, *, rng: n
 # --- what all views share
 
 
-def build_stage(plant: Plant, *, seed: int) -> Stage:
+def build_stage(plant: SimulatedPlant, *, seed: int) -> Stage:
     """The plant with a `Look` drawn from the seed, ready for `render_stage`."""
     mesh = merge_meshes(plant)
     vertices, faces = mesh.vertices, mesh.faces
@@ -163,7 +163,7 @@ def build_stage(plant: Plant, *, seed: int) -> Stage:
     )  # fmt: skip
 
 
-def merge_meshes(plant: Plant) -> Mesh:
+def merge_meshes(plant: SimulatedPlant) -> Mesh:
     """The leaves, and after them the parts, as one mesh."""
     leaf_material = MATERIALS.index("leaf")
     meshes = [(leaf.vertices, leaf.faces, leaf_material, leaf.leaf_id, leaf.dryness) for leaf in plant.leaves]

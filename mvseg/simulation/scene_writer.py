@@ -26,7 +26,7 @@ from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
 from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras, Scene, View
-from mvseg.simulation.growth import Plant
+from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.system.atomic import folder_whole
 
@@ -34,7 +34,7 @@ JPEG_QUALITY = 90
 MIN_PIXELS = 30  # a leaf with fewer visible pixels in a view is left out of that view's masks and truth
 
 
-def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int) -> None:
+def write_scene(folder: Path | str, plant: SimulatedPlant, cameras: Cameras, *, seed: int) -> None:
     """Photograph a plant and write the scene folder described at the top of this module.
 
     Args:
@@ -54,7 +54,7 @@ def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int
         write_truth(partial / "truth", plant)
 
 
-def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int) -> None:
+def write_views(folder: Path, plant: SimulatedPlant, cameras: Cameras, *, seed: int) -> None:
     """Write rig file, photos, masks and true label images."""
     (folder / "images").mkdir()
     stage = build_stage(plant, seed=seed)
@@ -71,7 +71,7 @@ def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int) -> N
     write_rig(folder / "cameras.json", scene, files)
 
 
-def write_truth(folder: Path, plant: Plant) -> None:
+def write_truth(folder: Path, plant: SimulatedPlant) -> None:
     """Write the leaf meshes and the table of traits."""
     (folder / "leaves").mkdir()
     sizes = [(f"{leaf.length:.6f}", f"{leaf.width:.6f}", f"{leaf.area:.6f}") for leaf in plant.leaves]

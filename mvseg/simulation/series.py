@@ -28,7 +28,7 @@ from mvseg.simulation.growth import (
     POSES_TRIED,
     Frond,
     Node,
-    Plant,
+    SimulatedPlant,
     crowding,
     grow_frond,
     lift_frond,
@@ -130,7 +130,7 @@ class GrowingPlant:
     shoots: tuple[tuple[Node, Floats, float], ...]  # foot, (levels,) full gaps, tilt
     seats: tuple[_Seat, ...]
 
-    def at(self, day: float, *, is_wilted: bool = False) -> Plant:
+    def at(self, day: float, *, is_wilted: bool = False) -> SimulatedPlant:
         """The plant as it is on a day, its pot straight at the origin; the leaves that are there, with their ids."""
         family = FAMILIES[self.spec.family]
         if is_wilted:
@@ -148,7 +148,7 @@ class GrowingPlant:
             for number, blade in zip(seat.ids, frond.blades, strict=True):
                 leaves.append(_age(leaf_from_blade(number, blade), (day - seat.yellows) / YELLOWING))
         parts = (*tubes, *pot_parts(self.pot, np.random.default_rng([self.spec.seed, 1])))
-        return Plant(family=self.spec.family, leaves=tuple(leaves), parts=parts, stems=tuple(stems))
+        return SimulatedPlant(family=self.spec.family, leaves=tuple(leaves), parts=parts, stems=tuple(stems))
 
     def _stem(self, index: int, day: float) -> Floats:
         foot, gaps, tilt = self.shoots[index]
@@ -250,7 +250,7 @@ def draw_pots(spec: SeriesSpec) -> list[PotPlace]:
     return pots
 
 
-def move_plant(plant: Plant, pot: PotPlace) -> Plant:
+def move_plant(plant: SimulatedPlant, pot: PotPlace) -> SimulatedPlant:
     """The plant, its pot and the soil where the pot stands."""
 
     def moved(part: Part) -> Part:
@@ -261,7 +261,7 @@ def move_plant(plant: Plant, pot: PotPlace) -> Plant:
     return replace(plant, leaves=leaves, parts=tuple(moved(part) for part in plant.parts), stems=stems)
 
 
-def grow_series(spec: SeriesSpec) -> list[Plant]:
+def grow_series(spec: SeriesSpec) -> list[SimulatedPlant]:
     """The plant on every date, where its pot stands; a leaf has the same id on all dates.
 
     Raises:
@@ -276,7 +276,7 @@ def grow_series(spec: SeriesSpec) -> list[Plant]:
     return plants
 
 
-def series_cameras(spec: SeriesSpec, index: int, plant: Plant) -> Cameras:
+def series_cameras(spec: SeriesSpec, index: int, plant: SimulatedPlant) -> Cameras:
     """Cameras around the plant on a date; from the middle of the series on another rig."""
     is_late = 2 * index >= len(spec.times)
     heights = (10.0, 40.0, 70.0) if is_late else (20.0, 50.0)

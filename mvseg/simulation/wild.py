@@ -14,14 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Floats, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import Plant
+from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.pot import Part, make_tube
 
 MOST_LEAVES_WITH_COTYLEDONS = 12  # older plants have shed them
 SOIL_CLEARANCE = 2.0  # mm; leaves hang down no further
 
 
-def make_wild(plant: Plant, seed: int) -> Plant:
+def make_wild(plant: SimulatedPlant, seed: int) -> SimulatedPlant:
     """The plant with some of its leaves withered, and with buds, twigs, woody stems and cotyledons, each by chance.
 
     Args:

@@ -25,7 +25,7 @@ from mvseg.scene import Cameras
 from mvseg.training.photo_faults import draw
 
 if TYPE_CHECKING:
-    from mvseg.simulation.growth import Plant
+    from mvseg.simulation.growth import SimulatedPlant
     from mvseg.simulation.look import Floats
 
 BACKGROUND_PX = 768  # longer side at which background photos are kept in memory
@@ -75,7 +75,7 @@ def render_new_plant(
     return label_photo(rgb, drop_small(shot.ids, 16))
 
 
-def place_camera(plant: Plant, size: int, rng: np.random.Generator) -> Cameras:
+def place_camera(plant: SimulatedPlant, size: int, rng: np.random.Generator) -> Cameras:
     """One camera of S x S pixels from any side above the ground, that has one leaf of the plant in sight, at 0.6 to
     4 times the focal length that fills the frame."""
     from mvseg.simulation.cameras import arc_cameras

@@ -20,9 +20,9 @@ from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import MOST_BYTES, pack_known, unpack_known
+from mvseg.pipeline.before_edits import MOST_BYTES, pack_plant, unpack_plant
 from mvseg.pipeline.find_in_photos import find_in_photos
-from mvseg.pipeline.known import Known
+from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import Approach
 from mvseg.scene import Cameras, Scene, View
@@ -60,9 +60,9 @@ def at(leaf: int, view: int) -> tuple[float, float]:
     return float(x) + 0.5, float(y) + 0.5
 
 
-def run(*edits: Edit) -> Known:
-    known = find_in_photos(open_photos(SCENE))
-    return apply_edits(known, Corrections(edits)) if edits else known
+def run(*edits: Edit) -> Plant:
+    plant = find_in_photos(open_photos(SCENE))
+    return apply_edits(plant, Corrections(edits)) if edits else plant
 
 
 @pytest.fixture(autouse=True)
@@ -72,7 +72,7 @@ def known_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.verification.leaf_color.count_colors", lambda *_: pytest.fail("no photo is needed"))
 
 
-def as_painted(state: Known) -> list[np.ndarray]:
+def as_painted(state: Plant) -> list[np.ndarray]:
     """V maps of which leaf every pixel shows: the true number."""
     masks = state.masks
     leaves = IDS[masks.regions.labels] * (masks.instance_ids > 0)
@@ -85,13 +85,13 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     opened.surfaces.surfaces["name"] = LEAVES[1]
     opened.surfaces.approaches.update({"one": approach, "other": None})
     opened.snapped["edge"] = REGIONS.crop(0).numpy()
-    content = pack_known(find_in_photos(opened), ["odd"])
+    content = pack_plant(find_in_photos(opened), ["odd"])
     assert content is not None
-    found = unpack_known(content, open_photos(SCENE))
+    found = unpack_plant(content, open_photos(SCENE))
     assert found is not None
-    known, said = found
-    cache = known.opened.surfaces
-    np.testing.assert_array_equal(known.opened.snapped["edge"], REGIONS.crop(0).numpy())
+    plant, said = found
+    cache = plant.opened.surfaces
+    np.testing.assert_array_equal(plant.opened.snapped["edge"], REGIONS.crop(0).numpy())
     assert torch.equal(cache.surfaces["name"].covariance, LEAVES[1].covariance)
     again = cache.approaches["one"]
     assert again is not None
@@ -100,18 +100,19 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     assert cache.approaches["other"] is None
     before = run()
     assert said == ["odd"]
-    assert known.instances.probabilities == before.instances.probabilities
-    assert (known.image_size, known.boxes) == (before.image_size, before.boxes)  # the detector learns from there
-    assert [each.chance for each in known.left] == [each.chance for each in before.left]
-    for state, other in ((known, before), (apply_edits(known, reject), apply_edits(before, reject))):
+    assert plant.instances.probabilities == before.instances.probabilities
+    assert plant.image_size == before.image_size  # the detector learns from there
+    assert torch.equal(plant.boxes, before.boxes)
+    assert [each.chance for each in plant.left] == [each.chance for each in before.left]
+    for state, other in ((plant, before), (apply_edits(plant, reject), apply_edits(before, reject))):
         np.testing.assert_array_equal(as_painted(state), as_painted(other))
     fewer = open_photos(SCENE.select(torch.arange(5)))
-    assert unpack_known(content, fewer) is None
+    assert unpack_plant(content, fewer) is None
     code = io.BytesIO()
-    torch.save({"views": opened.names, "known": run}, code)
+    torch.save({"views": opened.names, "plant": run}, code)
     bomb = zlib.compress(bytes(MOST_BYTES + 1) + content)
     for broken in (b"", content[:-9], bomb, zlib.compress(b"text"), zlib.compress(code.getvalue())):
-        assert unpack_known(broken, opened) is None
+        assert unpack_plant(broken, opened) is None
 
 
 def test_an_edit_is_about_the_mask_that_is_seen_whatever_it_scores() -> None:
@@ -157,29 +158,29 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:
-    known = find_in_photos(open_photos(SCENE))
-    assert len(known.instances.probabilities) == 3
-    assert [len(each) for each in known.matched] == [int((IDS != WEAK).sum()), len(IDS)]
-    once, twice = (apply_edits(known, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))
+    plant = find_in_photos(open_photos(SCENE))
+    assert len(plant.instances.probabilities) == 3
+    assert [len(each) for each in plant.matched] == [int((IDS != WEAK).sum()), len(IDS)]
+    once, twice = (apply_edits(plant, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))
     assert torch.equal(once.masks.instance_ids, twice.masks.instance_ids)
-    assert len(known.instances.probabilities) == 3
+    assert len(plant.instances.probabilities) == 3
 
 
 def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     edit = Reject(view="v0", at=at(1, 0), everywhere=True)
-    expected, known, used = run(edit), run(), []
+    expected, plant, used = run(edit), run(), []
 
     def choose(*given: Masks, drawn: tuple[Drawn, ...], **options: Any) -> Leaves:
         used.append(drawn)
         return choosing.choose_leaves(*given, drawn=drawn, **options)
 
-    known.draw_ahead()
-    ahead = known.drawn
+    plant.draw_ahead()
+    ahead = plant.drawn
     assert all("is_shared" in vars(each) for each in ahead)
-    for name in ("known.draw_views", "known.add_beside"):
+    for name in ("plant.draw_views", "plant.add_beside"):
         monkeypatch.setattr(f"mvseg.pipeline.{name}", None)  # nobody waits for these again
     monkeypatch.setattr("mvseg.pipeline.apply_edits.choose_leaves", choose)
-    found = apply_edits(known, Corrections((edit,)))
+    found = apply_edits(plant, Corrections((edit,)))
     assert used == [ahead]
     assert found.instances.probabilities == expected.instances.probabilities
     assert [each.chance for each in found.left] == [each.chance for each in expected.left]

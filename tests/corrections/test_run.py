@@ -24,8 +24,8 @@ from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.known import match_given
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import match_given
 from mvseg.results.result import Result
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
@@ -94,14 +94,14 @@ def test_edits_do_not_estimate_the_reprojection_error_again(plant: Path, monkeyp
         return match_masks(*args, residual_px=residual_px, **options)
 
     monkeypatch.setattr("mvseg.pipeline.apply_edits.match_masks", match)
-    known = match_given(open_scene(plant, plant / "masks", IDS_ONLY))
+    matched = match_given(open_scene(plant, plant / "masks", IDS_ONLY))
     outlines = {(view, ball): np.array(middle(plant, view, ball)) + SQUARE for view in range(4) for ball in (1, 2)}
     drawn = [
         {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()} for (view, _), polygon in outlines.items()
     ]
-    apply_edits(known, corrections({"op": "reject"} | at(plant, 0, 1)))
-    apply_edits(known, corrections(*drawn))
-    assert asked == [known.matching.report.residual_px, None]
+    apply_edits(matched, corrections({"op": "reject"} | at(plant, 0, 1)))
+    apply_edits(matched, corrections(*drawn))
+    assert asked == [matched.matching.report.residual_px, None]
     assert asked[0] is not None
 
 

@@ -10,16 +10,16 @@ import torch
 
 from mvseg.errors import InputError
 from mvseg.simulation.cameras import FRAME_FILL, arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 
 
 @pytest.fixture(scope="module")
-def plant() -> Plant:
+def plant() -> SimulatedPlant:
     return grow_plant("ovate", 12, seed=2)
 
 
 @pytest.mark.parametrize("size", [(480, 480), (320, 200), (100, 300)])
-def test_the_farthest_point_of_leaves_and_stems_fills_the_frame(plant: Plant, size: tuple[int, int]) -> None:
+def test_the_farthest_point_of_leaves_and_stems_fills_the_frame(plant: SimulatedPlant, size: tuple[int, int]) -> None:
     cameras = arc_cameras(5, plant, width=size[0], height=size[1])
     stems = [part.vertices for part in plant.parts if part.material == "stem"]
     px, depth = cameras.project(torch.from_numpy(np.concatenate([leaf.vertices for leaf in plant.leaves] + stems)))
@@ -28,7 +28,7 @@ def test_the_farthest_point_of_leaves_and_stems_fills_the_frame(plant: Plant, si
     assert ((px - half).abs() / half).max().item() == pytest.approx(FRAME_FILL)
 
 
-def test_arc_spans_its_angle_at_its_elevations_around_one_point(plant: Plant) -> None:
+def test_arc_spans_its_angle_at_its_elevations_around_one_point(plant: SimulatedPlant) -> None:
     cameras = arc_cameras(5, plant, start_deg=30)
     center = torch.linalg.lstsq(
         cameras.R[:, :2].reshape(-1, 3), -cameras.t[:, :2].reshape(-1, 1)
@@ -43,7 +43,7 @@ def test_arc_spans_its_angle_at_its_elevations_around_one_point(plant: Plant) ->
     assert (cameras.R[:, 1, 2] < 0).all()  # upright: image down is world down
 
 
-def test_ring_has_no_camera_twice_and_one_view_is_enough(plant: Plant) -> None:
+def test_ring_has_no_camera_twice_and_one_view_is_enough(plant: SimulatedPlant) -> None:
     ring = arc_cameras(4, plant, span_deg=360, elevations_deg=(0.0,))
     gaps = torch.cdist(ring.centers, ring.centers) + 1e9 * torch.eye(4, dtype=torch.float64)
     assert gaps.min() == pytest.approx(gaps[0, 1].item())
@@ -60,6 +60,6 @@ def test_ring_has_no_camera_twice_and_one_view_is_enough(plant: Plant) -> None:
         ({"elevations_deg": (90.0,)}, "elevations"),
     ],
 )
-def test_impossible_arcs_are_refused(plant: Plant, changes: dict[str, Any], message: str) -> None:
+def test_impossible_arcs_are_refused(plant: SimulatedPlant, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         arc_cameras(**{"num_views": 3, "plant": plant, **changes})

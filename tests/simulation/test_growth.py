@@ -10,10 +10,10 @@ from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.errors import InputError
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import Plant, grow_plant, grow_shoots
+from mvseg.simulation.growth import SimulatedPlant, grow_plant, grow_shoots
 
 
-def share_of_crossing_leaves(plant: Plant) -> float:
+def share_of_crossing_leaves(plant: SimulatedPlant) -> float:
     """Share of the leaves of which more than one mesh edge in fifty passes through another leaf."""
     starts = np.cumsum([0] + [len(leaf.vertices) for leaf in plant.leaves])
     faces = np.concatenate([leaf.faces + start for leaf, start in zip(plant.leaves, starts[:-1], strict=True)])
@@ -30,7 +30,7 @@ def share_of_crossing_leaves(plant: Plant) -> float:
     return crossing / len(plant.leaves)
 
 
-def check_meshes(plant: Plant) -> None:
+def check_meshes(plant: SimulatedPlant) -> None:
     for leaf in plant.leaves:
         assert leaf.faces.dtype == np.int32
         assert leaf.vertices.dtype == np.float64
@@ -74,7 +74,7 @@ def test_leggy_stems_are_bare() -> None:
     assert lowest["leggy"] > 2 * lowest["ovate"]
 
 
-def flatten(plant: Plant) -> bytes:
+def flatten(plant: SimulatedPlant) -> bytes:
     meshes = [(leaf.vertices, leaf.faces) for leaf in plant.leaves]
     meshes += [(part.vertices, part.faces) for part in plant.parts]
     return b"".join(array.tobytes() for mesh in meshes for array in mesh)

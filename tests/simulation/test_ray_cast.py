@@ -12,7 +12,7 @@ from mvseg.scene import Cameras
 from mvseg.simulation.blades import Leaf
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import draw_look
 from mvseg.simulation.pot import Part
 from mvseg.simulation.ray_cast import Rendering, build_stage, render_stage
@@ -22,11 +22,11 @@ from rendered import render_view
 SIZE = 40
 
 
-def ring(plant: Plant, size: int = SIZE) -> Cameras:
+def ring(plant: SimulatedPlant, size: int = SIZE) -> Cameras:
     return arc_cameras(4, plant, width=size, height=size)
 
 
-def shoot(plant: Plant, *, seed: int = 0, size: int = SIZE) -> Rendering:
+def shoot(plant: SimulatedPlant, *, seed: int = 0, size: int = SIZE) -> Rendering:
     return render_view(plant, ring(plant, size), 0, seed=seed)
 
 
@@ -55,7 +55,7 @@ def look_up(height: float) -> Cameras:
     return one_camera(focal=80.0, size=(16, 16), R=torch.eye(3), height=height)
 
 
-def rasterize(plant: Plant, cameras: Cameras, view: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def rasterize(plant: SimulatedPlant, cameras: Cameras, view: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Ids and depths by projecting every triangle with OpenCV and searching the nearest one over each pixel centre."""
     K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
     size = int(cameras.sizes[view, 0])
@@ -108,7 +108,7 @@ def test_half_a_pixel_matters() -> None:
 def test_pixel_centres_decide() -> None:
     cameras = look_down(100.0, focal=100.0, size=(8, 6))  # one unit of the plane is one pixel
     square = make_square(7, [[-2.4, 1.4, 0], [-2.4, -1.6, 0], [1.6, -1.6, 0], [1.6, 1.4, 0]])
-    ids = render_view(Plant("ovate", (square,), ()), cameras, 0, seed=0).ids
+    ids = render_view(SimulatedPlant("ovate", (square,), ()), cameras, 0, seed=0).ids
     expected = np.zeros((6, 8), np.uint16)
     expected[2:5, 2:6] = 7  # rows 1.6 to 4.6 and columns 1.6 to 5.6 hold the centres 2.5 to 4.5 and 2.5 to 5.5
     assert ids.tolist() == expected.tolist()
@@ -116,16 +116,16 @@ def test_pixel_centres_decide() -> None:
 
 def test_depth_of_a_level_and_of_a_tilted_plane() -> None:
     cameras = look_down(300.0)
-    shot = render_view(Plant("ovate", (make_level_square(1, 90, 0),), ()), cameras, 0, seed=0)
+    shot = render_view(SimulatedPlant("ovate", (make_level_square(1, 90, 0),), ()), cameras, 0, seed=0)
     assert shot.depth == pytest.approx(np.full((16, 16), 300.0), rel=1e-6)
     tilted = make_square(1, [[-90, 90, -45], [-90, -90, -45], [90, -90, 45], [90, 90, 45]])  # z = x / 2
-    shot = render_view(Plant("ovate", (tilted,), ()), cameras, 0, seed=0)
+    shot = render_view(SimulatedPlant("ovate", (tilted,), ()), cameras, 0, seed=0)
     slope = (np.arange(16) + 0.5 - 8) / 80  # x = slope * depth and depth = 300 - x / 2
     assert shot.depth == pytest.approx(np.tile(300 / (1 + slope / 2), (16, 1)), rel=1e-6)
 
 
 def test_the_nearer_leaf_hides_the_other_from_both_sides() -> None:
-    plant = Plant("ovate", (make_level_square(1, 90, 0.0), make_level_square(2, 90, 5.0)), ())
+    plant = SimulatedPlant("ovate", (make_level_square(1, 90, 0.0), make_level_square(2, 90, 5.0)), ())
     above, below = (render_view(plant, cameras, 0, seed=0) for cameras in (look_down(300.0), look_up(300.0)))
     assert np.unique(above.ids).tolist() == [2]
     assert np.unique(below.ids).tolist() == [1]
@@ -133,7 +133,7 @@ def test_the_nearer_leaf_hides_the_other_from_both_sides() -> None:
 
 def test_a_ray_that_hits_nothing_is_infinitely_long() -> None:
     stake = Part("stake", np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32))
-    away = render_view(Plant("ovate", (), (stake,)), look_up(-50.0), 0, seed=0)
+    away = render_view(SimulatedPlant("ovate", (), (stake,)), look_up(-50.0), 0, seed=0)
     assert np.isinf(away.depth).all()
     assert not away.ids.any()
 
@@ -153,7 +153,7 @@ def test_reruns_are_bit_identical() -> None:
 
 
 def test_views_share_the_light_but_not_the_noise() -> None:
-    stage = build_stage(Plant("ovate", (make_level_square(1, 900, 0),), ()), seed=0)
+    stage = build_stage(SimulatedPlant("ovate", (make_level_square(1, 900, 0),), ()), seed=0)
     cameras = [look_down(height, size=(64, 64)) for height in (300.0, 300.5)]
     one, two = (render_stage(stage, some, 0).rgb.astype(float) for some in cameras)
     assert np.abs(one - two).mean() > 0.5
@@ -175,7 +175,7 @@ def test_photos_are_exposed_and_leaves_are_green(seed: int, family: str) -> None
 
 def test_shadow_of_a_leaf_darkens_the_soil() -> None:
     soil = make_level_square(1, 900, 0)
-    plant = Plant("ovate", (make_level_square(1, 60, 40),), (Part("ground", soil.vertices, soil.faces),))
+    plant = SimulatedPlant("ovate", (make_level_square(1, 60, 40),), (Part("ground", soil.vertices, soil.faces),))
     looks = ((seed, draw_look(np.random.default_rng(seed))) for seed in range(50))
     sunny, look = next((seed, look) for seed, look in looks if look.sun[1] > 1.4)
     shot = render_view(plant, look_down(200.0, focal=40.0, size=(64, 64)), 0, seed=sunny)

@@ -17,7 +17,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
 from mvseg.simulation import scene_writer
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.scene_writer import MIN_PIXELS, write_scene
 from rendered import render_view
 
@@ -25,17 +25,17 @@ SIZE = 96
 
 
 @pytest.fixture(scope="module")
-def plant() -> Plant:
+def plant() -> SimulatedPlant:
     return grow_plant("ovate", 12, seed=2)
 
 
 @pytest.fixture(scope="module")
-def cameras(plant: Plant) -> Cameras:
+def cameras(plant: SimulatedPlant) -> Cameras:
     return arc_cameras(3, plant, width=SIZE, height=SIZE)
 
 
 @pytest.fixture(scope="module")
-def scene(plant: Plant, cameras: Cameras, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(plant: SimulatedPlant, cameras: Cameras, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes") / "basil"
     write_scene(folder, plant, cameras, seed=5)
     return folder
@@ -57,7 +57,9 @@ def test_rig_file_gives_the_cameras_back(scene: Path, cameras: Cameras) -> None:
 
 
 @pytest.mark.parametrize("view", range(3))
-def test_truth_is_the_rendering_without_slivers(scene: Path, plant: Plant, cameras: Cameras, view: int) -> None:
+def test_truth_is_the_rendering_without_slivers(
+    scene: Path, plant: SimulatedPlant, cameras: Cameras, view: int
+) -> None:
     ids = render_view(plant, cameras, view, seed=5).ids
     truth = read_labels(scene, "truth", view)
     numbers, counts = np.unique(ids, return_counts=True)
@@ -80,7 +82,7 @@ def test_masks_are_a_new_numbering_of_the_truth_in_every_view(scene: Path) -> No
     assert len({tuple(numbering[leaf] for leaf in sorted(shared)) for numbering in numberings}) == 3
 
 
-def test_truth_sizes_and_meshes_are_those_of_the_leaves(scene: Path, plant: Plant) -> None:
+def test_truth_sizes_and_meshes_are_those_of_the_leaves(scene: Path, plant: SimulatedPlant) -> None:
     with (scene / "truth" / "traits.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [int(row["leaf_id"]) for row in rows] == [leaf.leaf_id for leaf in plant.leaves]
@@ -93,22 +95,24 @@ def test_truth_sizes_and_meshes_are_those_of_the_leaves(scene: Path, plant: Plan
     assert len(list((scene / "truth" / "leaves").iterdir())) == len(plant.leaves)
 
 
-def test_photo_is_the_rendering(scene: Path, plant: Plant, cameras: Cameras) -> None:
+def test_photo_is_the_rendering(scene: Path, plant: SimulatedPlant, cameras: Cameras) -> None:
     rgb = render_view(plant, cameras, 0, seed=5).rgb
     photo = cv2.imread(str(scene / "images" / "000.jpg"))[..., ::-1]
     assert np.abs(photo.astype(int) - rgb).mean() < 8  # JPEG
     assert np.abs(photo[..., ::-1].astype(int) - rgb).mean() > np.abs(photo.astype(int) - rgb).mean()
 
 
-def test_an_existing_scene_is_not_touched(scene: Path, plant: Plant, cameras: Cameras) -> None:
+def test_an_existing_scene_is_not_touched(scene: Path, plant: SimulatedPlant, cameras: Cameras) -> None:
     before = {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()}
     with pytest.raises(InputError, match="exists already"):
         write_scene(scene, plant, cameras, seed=0)
     assert {path: path.read_bytes() for path in scene.rglob("*") if path.is_file()} == before
 
 
-def test_an_interrupted_write_leaves_nothing(tmp_path: Path, plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
-    def interrupt(folder: Path, plant: Plant) -> None:
+def test_an_interrupted_write_leaves_nothing(
+    tmp_path: Path, plant: SimulatedPlant, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(folder: Path, plant: SimulatedPlant) -> None:
         assert list(tmp_path.iterdir()) != []
         raise KeyboardInterrupt
 

@@ -12,7 +12,7 @@ import trimesh
 from mvseg.simulation.blades import BLADE_COLUMNS, Blade, Floats, place_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import draw_look, draw_wild_look
 from mvseg.simulation.wild import SOIL_CLEARANCE, hang, make_wild, roll_up
 from rendered import render_view
@@ -20,7 +20,7 @@ from rendered import render_view
 FLAT = place_blade(Blade(length=60, width=40, outline=(0.6, 0.8)), np.array([0.0, 0, 80]), azimuth=0.7, elevation=0.2)
 
 
-def flatten(plant: Plant) -> bytes:
+def flatten(plant: SimulatedPlant) -> bytes:
     meshes = [(leaf.vertices, leaf.faces) for leaf in plant.leaves]
     meshes += [(part.vertices, part.faces) for part in plant.parts]
     return b"".join(array.tobytes() for mesh in meshes for array in mesh)

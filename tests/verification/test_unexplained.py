@@ -18,7 +18,7 @@ from mvseg.corrections.corrected import Fate
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
-from mvseg.pipeline.finish import finish
+from mvseg.pipeline.finish import check_result, shape_leaves
 from mvseg.verification.numbers import EVIDENCE
 from mvseg.verification.unexplained import find_missing, share_unexplained
 from three_leaves import true_maps
@@ -82,8 +82,8 @@ def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path, monkeypatch: pytest.Mo
     with warns_of("nothing_detected"):
         known = find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None)))
     with warns_of("no_leaves"):
-        finish(known)
+        check_result(shape_leaves(known), known)
     rejected = replace(known, edits=(Fate(1, "reject", "applied"),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        finish(rejected)
+        check_result(shape_leaves(rejected), rejected)

@@ -1,4 +1,4 @@
-"""What is known of a scene, from the first matching to the last edit; and masks that were given, matched."""
+"""One plant, from the first matching to the last edit; and given masks, matched."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -30,23 +31,24 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What is known of a scene: which mask shows which leaf, and what else there is to choose from.
+class Plant:
+    """Masks of one plant: which one shows which leaf, and what else there is to choose from.
+
+    Whoever made the masks, a plant is the same: given masks are proposals of which all are sure.
 
     Attributes:
         opened: the scene as it was opened.
-        matching: the masks with their ids, and what matching says of the scene.
-        instances: `starts` and `probabilities` of those that the views chose; nothing else.
-        proposals: R masks on the CPU, the excessive set of the detector; those that were given.
-        matched: tables of masks of it that are matched, the sure ones first; () where masks were given.
-        image_size: pixels, the longer side of the photos, or of their parts, as the detector saw them; 0 where masks
-            were given.
-        boxes: (V, 4) int64 xyxy, the parts of the photos that it looked at; None: all of them.
+        matching: D masks with their ids, and a report on the scene.
+        instances: initial surfaces (`starts`) and probabilities of the leaves that the views chose.
+        proposals: R masks on the CPU, the excessive set of the detector, or the given masks.
+        matched: tables of matched proposals, the sure ones first.
+        image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
+        boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
         left: candidates that the views did not choose.
-        edits: what came of a person's edits; () without any.
-        refused: pixels where a person says that no leaf is, and where no mask is.
-        learned: by the detector from this scene.
-        disagreement: where the views disagree about the masks, see `find_disagreement`.
+        edits: the user's edits with their fates; () without any.
+        refused: pixels without a mask where the user says that no leaf is.
+        learned: weights that the detector learned from this plant.
+        disagreement: finding on views that disagree about the masks, see `find_disagreement`; None: they agree.
     """
 
     opened: Opened
@@ -55,7 +57,7 @@ class Known:
     proposals: Masks
     matched: tuple[Masks, ...]
     image_size: int
-    boxes: Tensor | None
+    boxes: Tensor
     left: tuple[LeftOut, ...]
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
@@ -79,9 +81,8 @@ class Known:
 
     @property
     def longest_side(self) -> int:
-        """Pixels, of the photos or of their parts that the detector looked at."""
-        sizes = self.scene.cameras.sizes if self.boxes is None else self.boxes[:, 2:] - self.boxes[:, :2]
-        return int(sizes.max())
+        """Longer side of the parts of the photos that the segmenter saw, pixels."""
+        return int((self.boxes[:, 2:] - self.boxes[:, :2]).max())
 
     @cached_property
     def shown(self) -> Masks:
@@ -105,38 +106,44 @@ class Known:
         """The colours of leaves, see `colors_of_leaves`."""
         return colors_of_leaves(self.masks.to("cpu"), self.opened.photos)
 
-    def with_masks(self, masks: Masks) -> Known:
+    def with_masks(self, masks: Masks) -> Plant:
         """The same with other masks. Gaps between their ids close; what is known of the instances follows."""
         return replace(
             self, matching=self.matching.with_masks(masks.close_gaps()), instances=self.instances.close_gaps(masks)
         )
 
-    def with_leaves(self, leaves: Leaves) -> Known:
+    def with_leaves(self, leaves: Leaves) -> Plant:
         """The same with the leaves that the views chose."""
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
         return replace(self, instances=instances, left=leaves.left).with_masks(leaves.masks)
 
-    def cut_merged(self) -> Known:
-        """Masks that show two leaves are cut, where that is asked for; surfaces know best which ones do, so where they
-        check the ids, they come first."""
-        return self.with_masks(split_merged(self.masks)) if self.opened.is_cut else self
+    def cut_merged(self) -> Plant:
+        """Cut masks that show two leaves, where the options ask for it."""
+        return self.with_masks(split_merged(self.masks)) if self.opened.config.split_merged else self
 
 
-def match_given(opened: Opened) -> Known:
+def match_given(opened: Opened) -> Plant:
     """The same id for given masks of the same leaf, see `match_masks`."""
     given = opened.given
     assert given is not None, "expected a scene with masks"
     with timed("match"):
         matching = match_masks(given, opened.scene.cameras, config=opened.config.match)
-    known = Known(
+    boxes = whole_photos(opened.scene)
+    plant = Plant(
         opened=opened,
         matching=matching,
         instances=Instances(),
         proposals=given.to("cpu"),
-        matched=(),
-        image_size=0,
-        boxes=None,
+        matched=(matching.masks,),
+        image_size=int(boxes.max()),
+        boxes=boxes,
         left=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return known.cut_merged()
+    return plant if opened.is_checked else plant.cut_merged()  # surfaces tell better which masks show two
+
+
+def whole_photos(scene: Scene) -> Tensor:
+    """(V, 4) int64 xyxy, boxes of the whole photos."""
+    sizes = scene.cameras.sizes.cpu()
+    return torch.cat((torch.zeros_like(sizes), sizes), 1)
