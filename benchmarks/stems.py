@@ -30,7 +30,7 @@ from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import KINDS, MIN_PIXELS, load_maps
 from mvseg.evaluation.truth import shown_instances
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
-from mvseg.reconstruction.stem.tube_evidence import UNKNOWN, tube_evidence
+from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
@@ -45,6 +45,7 @@ NUM_LEAVES, NUM_VIEWS = 8, 10
 PHYLLOTAXIS = {
     "ovate": "decussate", "lanceolate": "spiral", "lobed": "spiral", "strap": "distichous", "leggy": "decussate"
 }  # fmt: skip
+NUMBERS = {"gain": 1, "width_change": -1, "aspect": 1, "relative_aspect": 1, "probability": 1}  # sign: of stems
 HARD = ("strap", "fern", "lanceolate")
 
 
@@ -143,9 +144,9 @@ def collect_evidence(num_plants: int) -> list[dict[str, Any]]:
                 ids = torch.where(ids > 0, ids, -1)
                 surfaces = fit_surfaces(regions, ids, cameras, is_rough=True)
                 for instance, found in tube_evidence(regions, ids, cameras, surfaces=surfaces).items():
-                    numbers = {"gain": found.gain, "width_change": found.width_change, "aspect": found.aspect}
+                    numbers = {name: getattr(found, name) for name in NUMBERS}
                     about = {"family": family, "kind": kind, "is_stem": instance > NUM_LEAVES}
-                    rows.append({**about, **numbers, "probability": found.probability})
+                    rows.append({**about, **numbers, "features": found.features})
     return rows
 
 
@@ -153,7 +154,7 @@ def print_evidence(num_plants: int) -> None:
     rows = collect_evidence(num_plants)
     print("| masks | number | all leaves | straps, ferns, lanceolate | stems | leaves |")
     for kind in KINDS:
-        for name, sign in (("gain", 1), ("width_change", -1), ("aspect", 1), ("probability", 1)):
+        for name, sign in NUMBERS.items():
             known = [row for row in rows if row["kind"] == kind and np.isfinite(row[name])]
             stems = np.array([sign * row[name] for row in known if row["is_stem"]])
             leaves = [[sign * row[name] for row in known if not row["is_stem"] and row["family"] in of]
@@ -161,12 +162,7 @@ def print_evidence(num_plants: int) -> None:
             curve = [np.mean(stems[:, None] > np.array(each)) + np.mean(stems[:, None] == np.array(each)) / 2
                      for each in leaves]  # fmt: skip
             print(f"| {kind} | {name} | {curve[0]:.3f} | {curve[1]:.3f} | {len(stems)} | {len(leaves[0])} |")
-    features = np.array([
-        (row["gain"], *(row[name] if np.isfinite(row[name]) else other
-                        for name, other in zip(("width_change", "aspect"), UNKNOWN, strict=True)), 1)
-        for row in rows if np.isfinite(row["gain"])
-    ])  # fmt: skip
-    features[:, 2] = np.log(features[:, 2])
+    features = np.array([row["features"] for row in rows if np.isfinite(row["gain"])])
     is_stem = np.array([row["is_stem"] for row in rows if np.isfinite(row["gain"])])
     side, spread = np.where(is_stem, 1, -1), features.std(0)
 
@@ -174,7 +170,7 @@ def print_evidence(num_plants: int) -> None:
         misses = np.logaddexp(0, -side * (features @ weights))
         return float(misses.sum() + 0.1 * ((weights * spread) ** 2).sum())
 
-    print("weights:", np.round(minimize(loss, np.zeros(4)).x, 2).tolist())
+    print("weights:", np.round(minimize(loss, np.zeros(features.shape[1])).x, 2).tolist())
 
 
 def main() -> None:

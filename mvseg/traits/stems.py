@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.reconstruction.numbers import AXES
+from mvseg.reconstruction.numbers import AXES, TUBE
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.stem.leaf_bases import (
     BaseAxis,
@@ -32,7 +32,6 @@ from mvseg.traits.nodes import Stem, measure_stem
 
 Floats = NDArray[np.float64]
 
-LONG = 4.0  # chosen: length over width of a surface from which it may be a stem's
 MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
 LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
 MOST_GAP = 8.5  # chosen: longest step in a petiole that was traced, in cells
@@ -45,8 +44,7 @@ LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
 
 def find_tubes(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras) -> dict[int, TubeEvidence]:
     """{instance id: evidence that it is a stem} of those that are long enough to be one."""
-    long = {instance: each for instance, each in surfaces.items() if each.exists and each.length > LONG * each.width}
-    return tube_evidence(masks.regions, masks.instance_ids, cameras, surfaces=long)
+    return tube_evidence(masks.regions, masks.instance_ids, cameras, surfaces=surfaces, least_aspect=TUBE.least_aspect)
 
 
 def find_stems(

@@ -19,11 +19,14 @@ from torch import Tensor
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.numbers import TUBE
+from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
+from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.verification.choice import Chosen, Said, choose
-from mvseg.verification.evidence import Bools, Drawn, draw_views
+from mvseg.verification.evidence import Bools, Drawn, Floats, draw_views
 from mvseg.verification.leaf_scores import Candidates
 from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
@@ -218,8 +221,27 @@ def gather_candidates(
                 certain[-1][rows[own & is_held]] = True
     if not columns:
         nothing = np.zeros((len(table), 0))
-        return Candidates((), nothing, nothing.astype(bool))
-    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy())
+        return Candidates((), nothing, nothing.astype(bool), stem=np.zeros(0))
+    stem = np.zeros(len(shapes)) if cameras is None else _stem_chances(shapes, members, table.regions, cameras)
+    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy(), stem=stem)
+
+
+def _stem_chances(
+    surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
+) -> Floats:
+    """(K,) probability that each candidate, of these members of R' regions, is a stem."""
+    ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
+    found = tube_evidence(
+        regions.select(torch.cat(list(members))),
+        ids,
+        cameras,
+        surfaces={number: each for number, each in enumerate(surfaces, start=1) if each is not None},
+        least_aspect=TUBE.least_aspect,
+    )
+    stem = np.zeros(len(surfaces))
+    for number, evidence in found.items():
+        stem[number - 1] = evidence.probability
+    return stem
 
 
 def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:

@@ -53,11 +53,13 @@ class Candidates:
         surfaces: K, None where the masks of one agree on none.
         matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
         certain: (D, K) bool: a person says that the mask shows the candidate.
+        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 without a surface.
     """
 
     surfaces: tuple[LeafSurface | None, ...]
     matched: Floats
     certain: Bools
+    stem: Floats
 
     def __len__(self) -> int:
         return len(self.surfaces)
@@ -129,10 +131,10 @@ def matched_features(matched: Floats, scores: Floats) -> Floats:
 
 
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(K,) P: how likely each candidate is a leaf; 1 where a person says so."""
+    """(K,) P: how likely each candidate is a leaf, and no stem; 1 where a person says so."""
     by_surface = expit(features @ list(fitted.leaf.values()))
     by_masks = expit(features[:, : len(fitted.found)] @ list(fitted.found.values()))
-    chances: Floats = np.where(candidates.has_surface, by_surface, by_masks)
+    chances: Floats = np.where(candidates.has_surface, by_surface * (1 - candidates.stem), by_masks)
     return np.where(candidates.is_certain, 1.0, chances)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from blade_scene import SIZE, as_regions, ring_cameras
+from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
 from known_leaves import flat_leaf
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
@@ -23,6 +23,7 @@ from mvseg.verification.leaf_scores import Candidates, leaf_features
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
+from tube_scene import BENT, tube_masks
 from warned import warns_of
 
 TRUE = true_maps()
@@ -303,9 +304,31 @@ def test_nearly_the_same_masks_are_one_candidate(number: int, is_new: bool) -> N
     assert len(candidates) == 1 + is_new
 
 
+@pytest.mark.parametrize("half_widths", [(0.45, 0.4), (0.08, 0.1)])
+def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> None:
+    """Unless all leaves are as slender: a strap is no stem."""
+    cameras, apart = ring_cameras(10), torch.tensor([0.0, 1.1, 0.0], dtype=torch.float64)
+    masks = [
+        blade_masks(EllipticBlade(half_width=width, bend=0.9), replace(cameras, t=cameras.t + side * cameras.R @ apart))
+        for width, side in zip(half_widths, (-1, 1), strict=True)
+    ]
+    masks.append(tube_masks(0.8 * BENT, np.full(len(BENT), 0.05), cameras))
+    every = Masks.concatenate([Masks.of(as_regions(each)[0]) for each in masks]).regions
+    proposals = proposals_of(every, torch.full((len(every),), 0.8))
+    matched = matched_of(proposals, torch.arange(1, 4).repeat_interleave(len(cameras)))
+    no_edits = torch.zeros(len(every), dtype=torch.bool)
+    found = [(matched, matched.regions.labels)]
+    stem = gather_candidates(found, cameras, table=proposals, is_held=no_edits).stem
+    leaves = choose_leaves(matched, proposals, cameras=cameras)
+    is_stem_told = max(half_widths) > 0.2
+    assert not stem[:2].any()
+    assert stem[2] > 0.9 if is_stem_told else stem[2] == 0
+    assert leaves.masks.num_instances == 3 - is_stem_told
+
+
 def test_clear_leaves_are_what_others_are_held_against() -> None:
     """Of three of which the views show 0.55, 0.75 and 0.85, the last two."""
-    candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros((2, 3), bool))
+    candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros((2, 3), bool), stem=np.zeros(3))
     best, sure = np.array([[0.55, 0.75, 0.85]] * 3), np.array([[0.2, 1.2, 1.6]] * 3)
     features, clear = leaf_features(candidates, best, sure, share=np.ones((3, 3)), clear=None)
     assert clear.score == pytest.approx(1.4)

@@ -25,9 +25,8 @@ from mvseg.reconstruction.surface.patch_image import view_ious
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-# fitted: python benchmarks/stems.py --cache DIR --plants 2 --evidence (gain, change, log(aspect), 1)
-WEIGHTS = (31.4, -6.4, 1.39, -3.3)
-UNKNOWN = (0.3, 8.0)  # chosen: width change and aspect where the views do not tell
+WEIGHTS = (40.82, -8.21, 1.88, 0.38)  # fitted: python benchmarks/stems.py --cache DIR --evidence
+UNKNOWN = (-1.0, 0.3)  # chosen: gain and width change where the views do not tell
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,8 @@ class TubeEvidence:
             whole, explain. About 0 for stems.
         width: median over places and views, world units.
         length: along the tube, world units.
+        relative_aspect: length over width of its surface, over the median of the plant's surfaces. Leaves that are long
+            and narrow are so on the whole plant.
     """
 
     tube: Tube
@@ -51,6 +52,7 @@ class TubeEvidence:
     width_change: float
     width: float
     length: float
+    relative_aspect: float
 
     @property
     def gain(self) -> float:
@@ -63,28 +65,39 @@ class TubeEvidence:
         return self.length / self.width if self.width > 0 else float("nan")
 
     @property
+    def features(self) -> tuple[float, float, float, float]:
+        """Gain, width change, logarithm of the relative aspect, and 1: `WEIGHTS` weigh them."""
+        gain, change = (
+            value if np.isfinite(value) else default
+            for value, default in zip((self.gain, self.width_change), UNKNOWN, strict=True)
+        )
+        return gain, change, float(np.log(self.relative_aspect)), 1.0
+
+    @property
     def probability(self) -> float:
         """How likely the candidate is a stem, where there are eight leaves to a stem."""
-        change = self.width_change if np.isfinite(self.width_change) else UNKNOWN[0]
-        aspect = self.aspect if np.isfinite(self.aspect) else UNKNOWN[1]
-        gain = self.gain if np.isfinite(self.gain) else -1.0
-        logit = float(np.dot(WEIGHTS, (gain, change, np.log(aspect), 1.0)))
-        return float(1 / (1 + np.exp(-logit)))
+        return float(1 / (1 + np.exp(-np.dot(WEIGHTS, self.features))))
 
 
 def tube_evidence(
-    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, surfaces: Mapping[int, LeafSurface]
+    regions: Regions,
+    instance_ids: Tensor,
+    cameras: Cameras,
+    *,
+    surfaces: Mapping[int, LeafSurface],
+    least_aspect: float = 0.0,
 ) -> dict[int, TubeEvidence]:
-    """Fit a tube to every instance that has a surface, and compare the two.
+    """Fit a tube to every instance whose surface is long enough, and compare the two.
 
     Args:
         regions: D regions. Those matched to nothing hide others as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
         surfaces: {instance id: surface}; rough ones will do.
+        least_aspect: min. `TubeEvidence.relative_aspect`; stems have more than `TUBE.least_aspect`.
 
     Returns:
-        {instance id: evidence} of those that have a surface.
+        {instance id: evidence}.
     """
     if not any(surface.exists for surface in surfaces.values()):
         return {}
@@ -93,8 +106,9 @@ def tube_evidence(
     offsets = [each.offsets_px[each.offsets_px.isfinite()].numpy() for each in surfaces.values() if each.exists]
     errors = learn_mask_errors([each for each in offsets if len(each) > 1])
     sd_px, found = 0.0 if errors is None else errors.sd_px, {}
+    usual_aspect = float(np.median([each.length / each.width for each in surfaces.values() if each.exists]))
     for instance, surface in sorted(surfaces.items()):
-        if not surface.exists:
+        if not surface.exists or surface.length < least_aspect * usual_aspect * surface.width:
             continue
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
@@ -103,26 +117,30 @@ def tube_evidence(
         chosen = views[spread_views(cameras[views], TUBE.most_views)]
         members = members.select((members.view_index[:, None] == chosen).any(1))
         masks = stack_instance(members, cameras, frames, instance=instance)
-        found[instance] = compare_tube(masks, surface, mask_sd_px=sd_px)
+        found[instance] = compare_tube(masks, surface, usual_aspect=usual_aspect, mask_sd_px=sd_px)
     return found
 
 
-def compare_tube(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float = 0.0) -> TubeEvidence:
+def compare_tube(
+    masks: MaskStack, surface: LeafSurface, *, usual_aspect: float, mask_sd_px: float = 0.0
+) -> TubeEvidence:
     """The evidence of the masks of one candidate with a surface.
 
     Args:
         masks: of the candidate.
         surface: that exists.
+        usual_aspect: median length over width of the plant's surfaces.
         mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large.
     """
     coefficients = surface.coefficients.numpy()
+    relative_aspect = surface.length / surface.width / usual_aspect
     tube = fit_tube(masks, midrib_of(coefficients), mask_sd_px=mask_sd_px)
     patch = float(np.median(patch_ious(masks, surface, mask_sd_px=mask_sd_px)))
     if not tube.exists:
         nan = float("nan")
-        return TubeEvidence(tube, nan, patch, nan, nan, nan)
+        return TubeEvidence(tube, nan, patch, nan, nan, nan, relative_aspect)
     change, width = width_change(masks, tube, mask_sd_px=mask_sd_px)
-    return TubeEvidence(tube, float(np.median(tube.iou)), patch, change, width, tube.length)
+    return TubeEvidence(tube, float(np.median(tube.iou)), patch, change, width, tube.length, relative_aspect)
 
 
 def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> Floats:
