@@ -40,6 +40,7 @@ ROUNDS = 3  # where nobody says how many; most plants gain nothing from the thir
 # Growth of the agreed area from which new weights stay. Where MV-PQ gained 0.04 or more, it grew by 1.13 to 1.23, and
 # by 1.08 where nothing was gained (docs/notes/detector.md).
 GROWTH = 1.1
+AGREEMENT = 0.75  # chosen: agreement of the views (`Leaves`) below which the detector does not know the leaves
 
 
 def learn(
@@ -90,15 +91,15 @@ def learn(
 
 
 def _count_rounds(plant: Plant) -> int:
-    """How many rounds to try; with "auto", none where the detector knows the species: it is sure of most leaves, and
-    sees them best at its own size."""
+    """How many rounds to try; with "auto", none where the detector knows the species: the views agree about its leaves,
+    it is sure of most of them, and sees them best at its own size."""
     opened = plant.opened
     if not opened.is_chosen or opened.config.learn == "off":
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    is_known = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not _is_smaller(plant)
-    return 0 if is_known else ROUNDS
+    is_sure = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not plant.agreement < AGREEMENT
+    return 0 if is_sure and not _is_smaller(plant) else ROUNDS
 
 
 def _is_smaller(plant: Plant) -> bool:

@@ -45,6 +45,7 @@ class Plant:
         image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
         left: candidates that the views did not choose.
+        agreement: of the views about the leaves, see `Leaves`; NaN where they do not choose.
         edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
         learned: weights that the detector learned from this plant.
@@ -59,6 +60,7 @@ class Plant:
     image_size: int
     boxes: Tensor
     left: tuple[LeftOut, ...]
+    agreement: float = float("nan")
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
     learned: Learned = NOTHING_LEARNED
@@ -115,7 +117,8 @@ class Plant:
     def with_leaves(self, leaves: Leaves) -> Plant:
         """The same with the leaves that the views chose."""
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
-        return replace(self, instances=instances, left=leaves.left).with_masks(leaves.masks)
+        chosen = replace(self, instances=instances, left=leaves.left, agreement=leaves.agreement)
+        return chosen.with_masks(leaves.masks)
 
     def cut_merged(self) -> Plant:
         """Cut masks that show two leaves, where the options ask for it."""

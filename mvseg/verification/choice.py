@@ -40,6 +40,11 @@ class Step:
     features: Floats
     rows: Ints
 
+    @property
+    def shown(self) -> float:
+        """Of what the views must show of it, the share that its masks show, see `leaf_features`."""
+        return float(self.features[1])
+
 
 @dataclass(frozen=True, eq=False)
 class Chosen:

@@ -51,12 +51,15 @@ class Leaves:
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
         left: the candidates that were not chosen, the most likely first.
+        agreement: of what the views must show of a leaf, the share that its masks show; mean over the leaves that have
+            a surface, NaN without any. Pieces of leaves, whose ids mix, have little.
     """
 
     masks: Masks
     surfaces: dict[int, LeafSurface]
     probabilities: dict[int, float]
     left: tuple[LeftOut, ...]
+    agreement: float = float("nan")
 
 
 def choose_leaves(
@@ -265,6 +268,7 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
     )
     shown = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
+    shares = [each.shown for each in chosen.steps if each.candidate in taken and candidates.has_surface[each.candidate]]
     return Leaves(
         masks=masks,
         surfaces={number: each for number, each in enumerate(shown, 1) if each is not None and each.is_credible},
@@ -274,4 +278,5 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
             for each in chosen.steps
             if each.candidate not in taken and len(each.rows)
         ),
+        agreement=float(np.round(np.mean(shares), CHOICE.digits)) if shares else float("nan"),
     )

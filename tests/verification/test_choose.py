@@ -80,6 +80,14 @@ def test_right_masks_are_chosen_as_they_are() -> None:
     assert len(leaves.masks) == len(REGIONS)
     assert all(chance > 0.9 for chance in leaves.probabilities.values())
     assert leaves.surfaces.keys() == {1, 2, 3}
+    assert leaves.agreement > 0.9
+
+
+def test_views_agree_less_about_a_leaf_that_half_of_them_lack() -> None:
+    rows = ((IDS != 1) | (REGIONS.view_index % 2 == 0)).nonzero()[:, 0]
+    proposals = proposals_of(REGIONS.select(rows), torch.full((len(rows),), 0.8))
+    leaves = choose(matched_of(proposals, IDS[rows]), proposals, fit=lambda *_: LEAVES)
+    assert leaves.agreement == pytest.approx(1 - 0.5 / 3, abs=0.06)
 
 
 def test_weak_proposals_fill_what_the_sure_ones_lack() -> None:
