@@ -2,8 +2,8 @@
 
 Surfaces of simulated leaves against their meshes, by family, number of views and kind of masks ("true": the visible
 parts; "degraded": with the faults of a segmenter; "detected": what the shipped detector finds in the photos; ids are
-those of the leaves that the masks show). Plants of 8 leaves, 480 x 480, cameras on a
-200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all leaves, also those
+those of the leaves that the masks show); and areas by the code of the reason to doubt them. Plants of 8 leaves, 480 x
+480, cameras on a 200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all leaves, also those
 that the quality flag doubts; leaves without a surface are counted, not averaged. Width is the simulator's without the
 teeth of the edge. "distance" is the symmetric mean distance of the two surfaces in % of the length, "inside" the share
 of true areas, lengths and widths inside their 95 % intervals, "base" the share of oriented leaves whose base is right,
@@ -77,7 +77,7 @@ def detect_masks(spec: SceneSpec, scene: LabelledScene, cache: Path) -> tuple[Re
 
 def compare(surface: LeafSurface, leaf: Leaf, teeth: float) -> dict[str, Any]:
     """Signed errors in %, degrees and % of the length; what the surface says of itself."""
-    record: dict[str, Any] = {"exists": surface.exists, "reasons": list(surface.quality.reasons)}
+    record: dict[str, Any] = {"exists": surface.exists, "reasons": [*surface.quality.reasons]}
     if not surface.exists:
         return record
     truth = (leaf.area, leaf.length, leaf.width / (1 + teeth))
@@ -136,6 +136,19 @@ def print_table(records: list[dict[str, Any]]) -> None:
             )
 
 
+def print_doubts(records: list[dict[str, Any]]) -> None:
+    """Errors of areas of leaves with no reason to doubt them, and with one."""
+    print(f"{'masks':10}{'doubt':16}   n{'area':>16}  inside")
+    for kind in sorted({r["masks"] for r in records}):
+        fitted = [r for r in records if r["masks"] == kind and r["exists"]]
+        for code in sorted({"; ".join(r["reasons"]) for r in fitted if len(r["reasons"]) < 2} | {"several"}):
+            rows = [r for r in fitted if (";".join(r["reasons"]) if len(r["reasons"]) < 2 else "several") == code]
+            if rows:
+                errors, inside = np.abs([r["area"] for r in rows]), np.mean([r["area_inside"] for r in rows])
+                area = f"{np.median(errors):9.2f} /{np.quantile(errors, 0.9):5.1f}"
+                print(f"{kind:10}{code or 'none':16}{len(rows):4}{area}{inside:8.2f}")
+
+
 def leave_one_out(folder: Path) -> None:
     """IoU of surfaces with the masks of a view that they were not fitted to."""
     torch.set_num_threads(1)
@@ -187,6 +200,7 @@ def main() -> None:
     if args.json:
         args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
     print_table(records)
+    print_doubts(records)
 
 
 if __name__ == "__main__":

@@ -119,7 +119,7 @@ def write_result(
         numbers |= {name: Measurement(value, 0.02 * value, "surface") for name, value in measured.items()}
         leaves.append(LeafTraits(
             leaf=number, numbers=numbers, method="none" if number in shapeless else "surface",
-            reasons=(reason,) if reason else (), rejection=rejected.get(number),
+            reasons={"test": reason} if reason else {}, rejection=rejected.get(number),
         ))  # fmt: skip
     regions = regions_from_label_maps([labels])
     whole = {"total_leaf_area": Measurement(5000.0, 50.0, "surface")}

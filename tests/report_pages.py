@@ -26,7 +26,7 @@ def rename_hostile(result: Result) -> Result:
     assert result.traits is not None
     views = tuple(replace(view, name=f"{index} {HOSTILE}") for index, view in enumerate(result.scene.views))
     scene = replace(result.scene, name=f"plant {HOSTILE}", unit=f"mm {HOSTILE}", views=views)
-    leaves = tuple(replace(leaf, reasons=(f"doubt {HOSTILE}",)) for leaf in result.traits.leaves)
+    leaves = tuple(replace(leaf, reasons={"test": f"doubt {HOSTILE}"}) for leaf in result.traits.leaves)
     traits = replace(result.traits, plant=scene.name, unit=scene.unit, leaves=leaves)
     return replace(result, scene=scene, instances=replace(result.instances, traits=traits), mask_kind=HOSTILE)
 

@@ -67,7 +67,7 @@ def _describe_traits(traits: Traits) -> dict[Any, Any]:
         said[leaf] = {name: torch.tensor([number.value, number.sd]) for name, number in numbers.items()}
         has_row = [name for name, number in numbers.items() if number.exists or name not in VOXEL_NAMES]
         said[leaf, "methods"] = {name: numbers[name].method for name in has_row}
-        said[leaf, "about"] = [[each.method, each.rejection, "; ".join(each.reasons)]
+        said[leaf, "about"] = [[each.method, each.rejection, each.quality]
                                for each in traits.leaves if each.leaf == leaf]  # fmt: skip
     return said
 

@@ -108,7 +108,7 @@ def test_every_public_name_is_on_the_page() -> None:
 # Names of other programs and files, examples of names, and columns of which the code has the first part only.
 ELSEWHERE = {"NA", "PIP_EXTRA_INDEX_URL", "SamAutomaticMaskGenerator", "cProfile", "compound_leaf", "data_file"}
 ELSEWHERE |= {"estimate_sim3d", "j_from_world", "kapture_mast3r_mapping.py", "px_from_cam"}
-ELSEWHERE |= {"save_conf", "shapes_to_label"}
+ELSEWHERE |= {"DataFrame", "save_conf", "shapes_to_label"}
 QUOTED = re.compile(r"`(?:[\w.]+/)*([A-Za-z_][\w.]*)(?:\(.*?\))?`")
 DOCSTRING = re.compile(r'""".*?"""', re.DOTALL)
 

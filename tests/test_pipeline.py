@@ -254,7 +254,7 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
 
     def fit(_: object, ids: torch.Tensor, *__: object, **___: object) -> dict[int, LeafSurface]:
         fits.append(ids.tolist())
-        return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
+        return {number: LeafSurface.none(torch.arange(2), "test", "a test") for number in (1, 2, 3)}
 
     def check(masks: Masks, *_: object, **__: object) -> Masks:
         ids = masks.instance_ids.clone()
@@ -291,7 +291,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
 
     def fit(_: object, ids: torch.Tensor, *__: object, **___: object) -> dict[int, LeafSurface]:
         fits.append(ids.tolist())
-        return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
+        return {number: LeafSurface.none(torch.arange(2), "test", "a test") for number in (1, 2, 3)}
 
     def check(masks: Masks, *_: object, **__: object) -> Masks:
         return show_two(masks)
@@ -316,11 +316,11 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
 def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
     plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    starts = {number: LeafSurface.none(torch.arange(2), f"start of {number}") for number in (2, 3)}
+    starts = {number: LeafSurface.none(torch.arange(2), "test", f"start of {number}") for number in (2, 3)}
     asked: list[dict[int, str]] = []
 
     def fit(_: object, ids: torch.Tensor, *__: object, starts: Any, **___: object) -> dict[int, LeafSurface]:
-        asked.append({number: each.quality.reasons[0] for number, each in starts.items()})
+        asked.append({number: each.quality.reasons["test"] for number, each in starts.items()})
         return {}
 
     def join(masks: Masks, *_: object, **__: object) -> Masks:

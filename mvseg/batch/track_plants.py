@@ -75,7 +75,7 @@ def track_plants(
 
     Args:
         plants: see `list_plants`.
-        out: tracks.csv, growth.csv, plants.csv, curves.csv, tracks.html and run.json; of several plants, the pages
+        out: the tables of `write_tables`, tracks.html and run.json; of several plants, the pages
             lie in `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
         pots: see `track_leaves`.

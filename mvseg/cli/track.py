@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from mvseg.tracking.recorded import RecordedTracks
 
 SOME_FAILED = 3
+LEAST_NAME = 4  # chosen: characters of a plant's name; "day" is none
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -27,7 +30,7 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--again", type=Path | None, help=help_again)
     help_times = "of each result: numbers (days) or ISO dates (2026-05-31 or 20260531)"
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
-    parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
+    parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: what the names of its results begin with)")
     parser.add_argument("--out", type=Path | None, help="folder for tables and pages (--again: the same)")
     help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
@@ -98,5 +101,13 @@ def _read_results(args: Namespace) -> RecordedTracks:
     else:
         if len(times) != len(results):
             raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
-        plants = [PlantResults(args.plant or out.resolve().name, tuple(results), tuple(times))]
+        plants = [PlantResults(args.plant or _name_plant(results) or out.resolve().name, tuple(results), tuple(times))]
     return RecordedTracks(out, tuple(plants), args.pots, corrections=None)
+
+
+def _name_plant(results: Sequence[Path]) -> str:
+    """What the names of all results begin with, without a date; nothing where that is short."""
+    names = (path.resolve().name for path in results)
+    shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+    name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")
+    return name if len(name) >= LEAST_NAME else ""

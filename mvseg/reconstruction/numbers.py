@@ -211,7 +211,7 @@ class TubeNumbers:
 
     mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
     difference: float = 1e-4  # limit: of u, for the directions of a cubic
-    # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.2, and no stem less than 2.9.
+    # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.6, no stem less than 2.9.
     least_aspect: float = 2.5  # chosen: min. length over width of a stem's surface, over the median of the plant
     rows: int = 24  # limit: places along a tube at which it is compared with its masks
     patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from

@@ -101,7 +101,8 @@ def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
             "leaf": leaf.leaf,
             "unit": traits.unit or None,
             "method": leaf.method,
-            "quality": "; ".join(leaf.reasons) or "good",
+            "use": leaf.use,
+            "quality": leaf.quality,
             "traits": {name: _rounded(number.value) for name, number in numbers.items()},
             "sd": {name: _rounded(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
         }

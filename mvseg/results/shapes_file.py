@@ -27,7 +27,7 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
 
     Arrays of N leaves: `leaf` (N,) int64, their ids; `coefficients` (N, 26, 3) and `covariance` (N, 78, 78) float64,
     `is_oriented` (N,) bool, see `LeafSurface`; `num_views` (N,) int64, and one after another `views` int64,
-    `residual_px` and `iou` float64; `num_reasons` (N,) int64, and one after another `reasons`, text.
+    `residual_px` and `iou` float64; `num_reasons` (N,) int64, and one after another `reasons`, text, and their codes.
     """
     leaves = sorted(surfaces)
     own = [surfaces[leaf] for leaf in leaves]
@@ -43,7 +43,8 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
         residual_px=np.concatenate([np.zeros(0), *(each.residual_px.cpu().numpy() for each in own)]),
         iou=np.concatenate([np.zeros(0), *(each.iou.cpu().numpy() for each in own)]),
         num_reasons=np.array([len(each) for each in reasons], np.int64),
-        reasons=np.array(sum(reasons, ()), np.str_),
+        reasons=np.array([text for each in reasons for text in each.values()], np.str_),
+        codes=np.array([code for each in reasons for code in each], np.str_),
     )
 
 
@@ -56,10 +57,12 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
     arrays = _read(path)
     try:
         views, residuals, ious = (_split(arrays[name], arrays["num_views"]) for name in ("views", "residual_px", "iou"))
-        reasons = _split(arrays["reasons"], arrays["num_reasons"])
+        texts = arrays["reasons"]
+        both = texts, arrays.get("codes", texts)  # an older version has no codes
+        reasons, names = (_split(each, arrays["num_reasons"]) for each in both)
         coefficients = arrays["coefficients"].reshape(-1, NUM_COEFFICIENTS, 3)
         covariance = arrays["covariance"].reshape(-1, *(3 * NUM_COEFFICIENTS,) * 2)
-        rows = arrays["leaf"], arrays["is_oriented"], coefficients, covariance, views, residuals, ious, reasons
+        rows = arrays["leaf"], arrays["is_oriented"], coefficients, covariance, views, residuals, ious, reasons, names
         surfaces = {
             int(leaf): LeafSurface(
                 coefficients=torch.from_numpy(numbers.copy()),
@@ -68,9 +71,9 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
                 residual_px=torch.from_numpy(residual.copy()),
                 iou=torch.from_numpy(iou.copy()),
                 is_oriented=bool(is_oriented),
-                quality=Quality(tuple(doubts.tolist())),
+                quality=Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True))),
             )
-            for leaf, is_oriented, numbers, products, seen, residual, iou, doubts in zip(*rows, strict=True)
+            for leaf, is_oriented, numbers, products, seen, residual, iou, doubts, codes in zip(*rows, strict=True)
         }
         for leaf, each in surfaces.items():
             if not each.exists and (each.coefficients.isfinite().any() or not each.quality.reasons):

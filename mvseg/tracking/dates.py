@@ -55,6 +55,7 @@ class SeenLeaf:
         is_oriented: the first point of the midrib is known to be the base.
         numbers: {trait: number} of what was measured.
         is_doubted: it looks like a stem, as rolled leaves of seedlings do: it counts if another date shows the leaf.
+        node: numbers of its stem and of its node there; None: it is not known to sit on one.
     """
 
     leaf: int
@@ -64,6 +65,7 @@ class SeenLeaf:
     is_oriented: bool
     numbers: Mapping[str, Number]
     is_doubted: bool = False
+    node: tuple[int, int] | None = None
 
     @property
     def length(self) -> float:
@@ -140,10 +142,16 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
         units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in found}
         return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
 
+    nodes = {node.leaf: (stem.number, node) for stem in traits.stems for node in stem.nodes}
     for leaf in traits.leaves:
         if leaf.rejection is None or leaf.rejection == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
             seen = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
+            if leaf.leaf in nodes:
+                stem, node = nodes[leaf.leaf]
+                measured = {"internode": (node.internode, traits.unit), "divergence": (node.divergence, "degree")}
+                numbers = {name: Number(m.value, m.sd, unit) for name, (m, unit) in measured.items() if m.exists}
+                seen = replace(seen, numbers={**seen.numbers, **numbers}, node=(stem, node.number))
             leaves.append(replace(seen, is_doubted=leaf.rejection is not None))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,

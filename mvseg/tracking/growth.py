@@ -9,18 +9,21 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import expit
 
 from mvseg.system.running import kept
-from mvseg.tracking.dates import Floats, Number, PlantOnDate
+from mvseg.tracking.dates import Floats, Number
 from mvseg.tracking.numbers import GROWTH
 from mvseg.tracking.track import Tracks
 
-TRAITS = ("area", "length", "width", "inclination", "curvature", "insertion_height", "greenness_index")
+TRAITS = (
+    "area", "length", "width", "inclination", "curvature", "insertion_height", "node_height", "internode",
+    "greenness_index",
+)  # fmt: skip
 SIZES = ("area", "length", "width")  # get a curve, too
 NOTHING = Number(math.nan, math.nan, "")
 Heights = Mapping[int, Mapping[int, Number]]  # {track: {date: height of its base}}
@@ -28,8 +31,8 @@ Heights = Mapping[int, Mapping[int, Number]]  # {track: {date: height of its bas
 
 @dataclass(frozen=True)
 class GrowthPoint:
-    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours. `reference`
-    is the track that heights are counted by, see `level_heights`."""
+    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours; of two
+    dates the later one has it. `reference` is the track that heights are counted by, see `level_heights`."""
 
     track: int
     trait: str
@@ -78,7 +81,6 @@ class PlantRow:
         total_area: with its standard deviation.
         relative_growth_rate: of the area of those leaves that are measured on this date and the one before, per day,
             with its standard deviation.
-        divergence: degrees between the azimuths of leaves that follow each other up the stem, in [0, 180].
     """
 
     date: int
@@ -88,7 +90,6 @@ class PlantRow:
     phyllochron: float
     total_area: Number
     relative_growth_rate: Number
-    divergence: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -130,7 +131,8 @@ def measure_growth(tracks: Tracks) -> Growth:
         sds = np.array([number.sd for number in seen.values()])
         for place, (date, number) in enumerate(seen.items()):
             near = slice(max(place - 1, 0), place + 2)
-            rates = slope(times[near], values[near], sds[near])
+            is_told = place > 0 or len(seen) > 2
+            rates = slope(times[near], values[near], sds[near]) if is_told else (math.nan, math.nan)
             reference = references[date] if trait == "insertion_height" else None
             points.append(GrowthPoint(track, trait, date, number, *rates, reference=reference))
         if trait in SIZES and len(seen) >= GROWTH.least_dates:
@@ -208,7 +210,6 @@ def _plant_rows(tracks: Tracks, points: Sequence[GrowthPoint]) -> Iterator[Plant
             phyllochron=(date.time - tracks.dates[0].time) / total_born if total_born else math.nan,
             total_area=date.whole.get("total_leaf_area", NOTHING),
             relative_growth_rate=_relative_growth(areas.get(index - 1, {}), areas.get(index, {}), days),
-            divergence=_divergence(date) if date.knows_up else (),
         )
 
 
@@ -221,15 +222,6 @@ def _relative_growth(before: Mapping[int, Number], now: Mapping[int, Number], da
     errors = [math.hypot(*(numbers[track].sd for track in both)) for numbers in (before, now)]
     sd = math.hypot(errors[0] / sums[0], errors[1] / sums[1])
     return Number(math.log(sums[1] / sums[0]) / days, sd / days, "1/day")
-
-
-def _divergence(date: PlantOnDate) -> tuple[float, ...]:
-    leaves = sorted(
-        (leaf.numbers["insertion_height"].value, leaf.numbers["azimuth"].value)
-        for leaf in date.leaves
-        if {"insertion_height", "azimuth"} <= leaf.numbers.keys()
-    )
-    return tuple(round(abs((upper - lower + 180) % 360 - 180), 1) for (_, lower), (_, upper) in pairwise(leaves))
 
 
 # {model: the sizes at times (T,) by its parameters}, see `GrowthCurve`

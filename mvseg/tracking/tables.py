@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 from mvseg.formats.text_file import Cell, write_table
 from mvseg.tracking.growth import Growth
 from mvseg.tracking.track import Tracks
 
+NODE_NUMBERS = ("node_height", "internode", "divergence", "insertion_angle")
 COLUMNS = {
     "tracks.csv": ("plant", "time", "scene", "leaf", "track", "probability", "state"),
     "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd", "reference"),
     "plants.csv": (
         "plant", "time", "scene", "leaves", "born", "gone", "phyllochron", "total_area", "total_area_sd", "unit",
-        "relative_growth_rate", "relative_growth_rate_sd", "divergence_angles",
+        "relative_growth_rate", "relative_growth_rate_sd",
+    ),
+    "nodes.csv": (
+        "plant", "time", "scene", "stem", "node", "leaf", "track",
+        *(name + end for name in NODE_NUMBERS for end in ("", "_sd")), "unit",
     ),
     "curves.csv": (
         "plant", "track", "trait", "model", "size", "size_sd", "rate", "rate_sd", "middle", "middle_sd", "residual",
@@ -24,7 +29,7 @@ COLUMNS = {
 
 
 def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
-    """Write the four tables of one plant."""
+    """Write the tables of one plant; `nodes.csv` has a row per date and node."""
     rows: dict[str, list[tuple[Cell, ...]]] = {name: [] for name in COLUMNS}
 
     def add(file: str, *values: Cell) -> None:
@@ -40,8 +45,13 @@ def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
     for each in growth.plant:
         date, area, rate = tracks.dates[each.date], each.total_area, each.relative_growth_rate
         numbers = each.phyllochron, area.value, area.sd, area.unit, rate.value, rate.sd
-        angles = " ".join(f"{angle:g}" for angle in each.divergence)
-        add("plants.csv", date.written, date.scene, each.leaves, each.born, each.gone, *numbers, angles)
+        add("plants.csv", date.written, date.scene, each.leaves, each.born, each.gone, *numbers)
+    track_of = {(row.date, row.leaf): row.track for row in tracks.rows if row.leaf is not None}
+    for index, date in enumerate(tracks.dates):
+        nodes = [(leaf.node, leaf.leaf, leaf.numbers) for leaf in date.leaves if leaf.node is not None]
+        for node, leaf, own in sorted(nodes, key=lambda each: each[:2]):
+            pairs = [(own[name].value, own[name].sd) if name in own else (None, None) for name in NODE_NUMBERS]
+            add("nodes.csv", date.written, date.scene, *node, leaf, track_of[index, leaf], *chain(*pairs), date.unit)
     for curve in growth.curves:
         found = [number for pair in zip(curve.parameters, curve.sds, strict=True) for number in pair]
         add("curves.csv", curve.track, curve.trait, curve.model, *found, curve.residual)

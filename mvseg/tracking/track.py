@@ -32,7 +32,8 @@ class TrackRow:
 
     Attributes:
         date: index into `Tracks.dates`.
-        track: from 1 on, in the order of appearance.
+        track: from 1 on: from below, by the mean height of its base, where up is known on all dates; otherwise in the
+            order of appearance. The plants of other frames (`Tracks.roots`) and leaves without a shape come last.
         state: "born" where it appears after the first date, "seen", "hidden" where it is missing between two sights,
             "gone" on the first date on which it is missing for good.
         leaf: its id in that date's result; None where the track is hidden or gone.
@@ -122,7 +123,7 @@ def track_leaves(
         dates = believed
         compared, found = _link_dates(dates, links, pots)
     return Tracks(
-        plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
+        plant=plant, dates=dates, rows=_rank_tracks(_rows(dates, found, compared.roots), dates, compared),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
         warnings=tuple(_warnings(dates, compared)), chances=pairwise_chances(compared),
     )  # fmt: skip
@@ -208,6 +209,32 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.
         if date + 1 < len(dates) and roots[date] == roots[date + 1]:
             rows.append(TrackRow(date=date + 1, track=track, state="gone"))
     return tuple(sorted(rows, key=lambda row: (row.date, row.track)))
+
+
+def _rank_tracks(
+    rows: Sequence[TrackRow], dates: Sequence[PlantOnDate], compared: Comparison
+) -> tuple[TrackRow, ...]:
+    """Number the tracks from below, see `TrackRow.track`."""
+    bases = {(n, leaf.leaf): leaf.midrib for n, date in enumerate(dates) for leaf in date.leaves if date.knows_up}
+    heights: dict[int, list[float]] = {row.track: [] for row in rows}
+    first = dict[int, int]()  # root of each track
+    for row in rows:
+        midrib = None if row.leaf is None else bases.get((row.date, row.leaf))
+        first.setdefault(row.track, int(compared.roots[row.date]))
+        if midrib is not None:
+            pose = compared.poses[row.date]
+            heights[row.track].append(float(pose[2, :3] @ midrib[0] + pose[2, 3]))
+    if not all(date.knows_up for date in dates):
+        return tuple(rows)
+    scale = max(max(map(abs, each), default=0.0) for each in heights.values()) if heights else 0.0
+    digits = 6 - math.ceil(math.log10(scale)) if scale else 6  # no order hangs on the last bit
+    place = {
+        track: (first[track], not each, round(sum(each) / len(each), digits) if each else 0.0, track)
+        for track, each in heights.items()
+    }
+    number = {track: n for n, track in enumerate(sorted(place, key=lambda track: place[track]), start=1)}
+    ranked = [replace(row, track=number[row.track]) for row in rows]
+    return tuple(sorted(ranked, key=lambda row: (row.date, row.track)))
 
 
 def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:

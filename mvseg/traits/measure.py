@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
 
@@ -19,14 +20,18 @@ from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Kind, Rejection, find_rejected, median_iou
 from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.nodes import Stem
-from mvseg.traits.ontology import LEAF_TRAITS
+from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
 from mvseg.traits.stems import find_stems, find_tubes
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
 NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
-NO_VIEWS = torch.zeros(0, dtype=torch.int64)
+GOOD = "good"
+# Codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each (docs/traits.md).
+HARMLESS, USELESS = {"shows_more"}, {"poor_fit"}
+Use = Literal["yes", "look", "no"]
+NO_MASKS = LeafSurface.none(torch.zeros(0, dtype=torch.int64), "no_masks", "has no masks")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,15 +42,36 @@ class LeafTraits:
         leaf: its id.
         numbers: {trait: number} of all `LEAF_TRAITS`.
         method: "surface", "voxels", or "none" for an instance without a shape.
-        reasons: to doubt the numbers, or why there are none; empty for a good leaf.
+        reasons: {code: sentence} of the reasons to doubt the numbers, or why there are none; empty for a good leaf.
         rejection: kind of the reason why it does not count as a leaf, None where it does.
+        unit: of its lengths, "" when unknown.
     """
 
     leaf: int
     numbers: Mapping[str, Measurement]
     method: str
-    reasons: tuple[str, ...]
+    reasons: Mapping[str, str]
     rejection: Kind | None
+    unit: str = ""
+
+    @property
+    def quality(self) -> str:
+        """The reasons in words; "good" without any."""
+        return "; ".join(self.reasons.values()) or GOOD
+
+    @property
+    def use(self) -> Use:
+        """Whether to use its numbers: "yes", "look" at it first, or "no", where there are none of a leaf."""
+        if self.rejection is not None or self.method == "none" or USELESS & self.reasons.keys():
+            return "no"
+        return "yes" if self.method == "surface" and self.reasons.keys() <= HARMLESS else "look"
+
+    def __repr__(self) -> str:
+        area, length = self.numbers["area"], self.numbers["length"]
+        if not (area.exists and length.exists):
+            return f"leaf {self.leaf}: {self.quality}"
+        square, unit = (unit_of(DEFINITIONS[name].kind, self.unit) for name in ("area", "length"))
+        return f"leaf {self.leaf}: {area:.3g} {square}, {length:.3g} {unit} long"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +93,23 @@ class Traits:
     whole: Mapping[str, Measurement]
     up: tuple[float, float, float] | None
     stems: tuple[Stem, ...] = ()
+
+    def table(self) -> dict[str, list[Any]]:
+        """Columns with a row per leaf, which `pandas.DataFrame` takes: whether to `use` it, the codes of the `doubts`,
+        each trait with its standard deviation, the unit of lengths, the method, and the quality in words."""
+        columns: dict[str, list[Any]] = {
+            "plant": [self.plant] * len(self.leaves),
+            "leaf": [leaf.leaf for leaf in self.leaves],
+            "use": [leaf.use for leaf in self.leaves],
+            "doubts": ["; ".join(leaf.reasons) for leaf in self.leaves],
+        }
+        for trait in LEAF_TRAITS:
+            numbers = [leaf.numbers[trait.name] for leaf in self.leaves]
+            columns[trait.name] = [number.value for number in numbers]
+            if trait.has_sd:
+                columns[f"{trait.name}_sd"] = [number.sd for number in numbers]
+        columns["unit"] = [self.unit or UNKNOWN_UNIT] * len(self.leaves)
+        return columns | {name: [getattr(leaf, name) for leaf in self.leaves] for name in ("method", "quality")}
 
     @property
     def rejected(self) -> dict[int, Kind]:
@@ -140,9 +183,12 @@ def measure_plant(
             numbers |= {"node_height": node.height, "insertion_angle": node.insertion_angle}
         if instance in voxels and instance not in rejected:
             numbers |= measure_voxels(voxels[instance])
-        fitted = None if surfaces is None else surfaces.get(instance, LeafSurface.none(NO_VIEWS, "has no masks"))
-        rejection = rejected.get(instance)
-        leaves.append(describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejection))
+        fitted = None if surfaces is None else surfaces.get(instance, NO_MASKS)
+        leaves.append(
+            describe_leaf(
+                instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
+            )
+        )
     whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected))
     return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=stems)
 
@@ -154,30 +200,32 @@ def describe_leaf(
     *,
     fitted: LeafSurface | None,
     rejection: Rejection | None,
+    unit: str,
 ) -> LeafTraits:
     """The leaf with all of its traits, from the `numbers` that were measured; those that are missing with the reason.
 
     `shape` stands for it; `fitted` is its surface, credible or not, None where no surfaces were asked for; `rejection`
     says why it does not count as a leaf.
     """
-    no_shape = () if shape is not None else ("has no shape: seen in one view, or its masks agree on no point",)
-    reasons = no_shape if fitted is None else fitted.quality.reasons
+    reasons = {} if fitted is None else dict(fitted.quality.reasons)
+    if shape is None and fitted is None:
+        reasons = {"no_shape": "has no shape: seen in one view, or its masks agree on no point"}
     if rejection is not None:
-        reasons = (f"rejected: {rejection.reason}", *reasons)
-        why = reasons[0]
+        why = f"rejected: {rejection.reason}"
+        reasons = {rejection.kind: why, **reasons}
     elif fitted is None:
         why = "no surface was asked for"
     elif isinstance(shape, LeafSurface):
         why = "not measured: only voxels have it"
     else:
-        why = "; ".join(("no credible surface", *reasons))
-        reasons = (why,)
+        reasons = {"no_surface": "no credible surface", **reasons}
+        why = "; ".join(reasons.values())
     found = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     if isinstance(shape, LeafSurface):
-        found["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
+        found["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons.values())))
     elif shape is not None and (num_parts := shape.num_pieces) > 1:
-        reasons = (*reasons, f"in {num_parts} pieces")
+        reasons["pieces"] = f"in {num_parts} pieces"
         found["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     kind = None if rejection is None else rejection.kind
-    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=kind)
+    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=kind, unit=unit)

@@ -11,7 +11,7 @@ from mvseg.errors import InputError
 from mvseg.formats.text_file import read_table, write_table
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
-from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.measure import GOOD, LeafTraits, Traits
 from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
@@ -24,7 +24,6 @@ NODE_COLUMNS = (
     "phyllotaxis_probability",
 )  # fmt: skip
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
-GOOD = "good"
 
 
 def write_long(path: Path, traits: Traits) -> None:
@@ -45,17 +44,10 @@ def write_long(path: Path, traits: Traits) -> None:
 
 
 def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = MappingProxyType({})) -> None:
-    """One row per leaf: plant, leaf, each trait with its standard deviation beside it, the unit of lengths, the method,
-    the quality ("good", or the reasons to doubt the numbers), and how likely it is a leaf, where the views chose it."""
-    rows = []
-    for leaf in traits.leaves:
-        numbers: list[float] = []
-        for trait in LEAF_TRAITS:
-            number = leaf.numbers[trait.name]
-            numbers += [number.value, number.sd] if trait.has_sd else [number.value]
-        texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or GOOD
-        rows.append((traits.plant, leaf.leaf, *numbers, *texts, probabilities.get(leaf.leaf)))
-    write_table(path, wide_columns(), rows)
+    """One row per leaf, see `Traits.table`; and how likely it is a leaf, where the views chose it."""
+    columns = traits.table()
+    columns["probability"] = [probabilities.get(leaf) for leaf in columns["leaf"]]
+    write_table(path, list(columns), list(zip(*columns.values(), strict=True)))
 
 
 def write_nodes(path: Path, traits: Traits) -> None:
@@ -110,8 +102,7 @@ def _number(text: str) -> float:
 
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
-    pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in LEAF_TRAITS]
-    return ["plant", "leaf", *chain.from_iterable(pairs), "unit", "method", "quality", "probability"]
+    return [*Traits(plant="", unit="", leaves=(), whole={}, up=None).table(), "probability"]
 
 
 def read_traits(
@@ -136,7 +127,7 @@ def read_traits(
             value, sd = float(row["value"] or "nan"), float(row["sd"] or "nan")
             numbers.setdefault(int(row["leaf"] or 0), {})[row["trait"]] = Measurement(value, sd, row["method"])
         leaves = [
-            _read_leaf(int(row["leaf"]), row, numbers[int(row["leaf"])], rejected.get(int(row["leaf"])))
+            _read_leaf(int(row["leaf"]), row, numbers[int(row["leaf"])], rejected.get(int(row["leaf"])), unit=unit)
             for row in read_csv(wide, ("leaf", "method", "quality"))
         ]
     except (KeyError, ValueError) as error:
@@ -149,17 +140,19 @@ def read_traits(
 
 
 def _read_leaf(
-    leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement], rejection: Kind | None
+    leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement], rejection: Kind | None, *, unit: str
 ) -> LeafTraits:
-    reasons = () if row["quality"] == GOOD else tuple(row["quality"].split("; "))
+    texts = [] if row["quality"] == GOOD else row["quality"].split("; ")
+    codes = row["doubts"].split("; ") if "doubts" in row else texts  # an older version has none
     # The only ones that have no row: where there are no voxels, and in tables of older versions.
     absent = {name: missing("has no voxels") for name in VOXEL_NAMES} | {"node_height": missing("of an older version")}
     return LeafTraits(
         leaf=leaf,
         numbers={trait.name: {**absent, **numbers}[trait.name] for trait in LEAF_TRAITS},
         method=row["method"],
-        reasons=reasons,
+        reasons=dict(zip(codes, texts, strict=False)),
         rejection=rejection,
+        unit=unit,
     )
 
 

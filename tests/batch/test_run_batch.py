@@ -108,7 +108,7 @@ def test_the_tables_of_a_batch(here: None, plants: Path, tmp_path: Path, capsys:
     assert [(row["scene"], row["leaf"]) for row in wide] == [
         (scene, str(leaf)) for scene in ("plants_basil", "plants_mint") for leaf in (1, 2, 3)
     ]
-    assert list(wide[0])[:6] == ["scene", "plant", "time", "pot", "leaf", "area"]  # plant once, as the list has it
+    assert list(wide[0])[:6] == ["scene", "plant", "time", "pot", "leaf", "use"]  # plant once, as the list has it
     summary = read_table(out / "tables" / "summary.csv")
     columns = ("scene", "plant", "state", "instances", "masks", "views", "warnings", "warning_text")
     warning = str(Finding("unit_only_renamed", values={"before": "mm", "unit": "cm"}))

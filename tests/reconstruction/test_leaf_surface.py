@@ -59,7 +59,7 @@ def test_numbers_that_are_none_have_no_deviation() -> None:
         True,
         False,
     ]
-    nothing = LeafSurface.none(torch.tensor([0]), "seen in one view only")
+    nothing = LeafSurface.none(torch.tensor([0]), "test", "seen in one view only")
     assert not nothing.is_credible
     assert surface.is_credible
     assert np.isnan(nothing.deviation(one_by_one)).all()

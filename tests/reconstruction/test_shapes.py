@@ -32,7 +32,7 @@ def two_blades() -> tuple[Regions, torch.Tensor]:
 
 def test_instances_without_a_credible_surface_get_voxels(two_blades: tuple[Regions, torch.Tensor]) -> None:
     """The voxels that voxels alone would give: other instances hide as before."""
-    surfaces = {n: LeafSurface.none(torch.arange(6 - 2 * n), "for the test") for n in (1, 2)}
+    surfaces = {n: LeafSurface.none(torch.arange(6 - 2 * n), "test", "for the test") for n in (1, 2)}
     with warns_of("no_shape"):
         voxels = reconstruct_voxels(*two_blades, CAMERAS, config=COARSE, surfaces=surfaces)
     with warns_of("no_shape"):

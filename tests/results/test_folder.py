@@ -277,7 +277,7 @@ class TestVariants:
         """Leaf 1 has both, leaf 2 a surface only, leaf 3 a surface that is none, and voxels."""
         assert result.voxels is not None
         blade = bent_blade()
-        none = LeafSurface.none(torch.tensor([0]), "seen in one view only")
+        none = LeafSurface.none(torch.tensor([0]), "test", "seen in one view only")
         surfaces, voxels = {1: blade, 2: blade, 3: none}, {1: result.voxels[1], 3: result.voxels[3]}
         instances = replace(result.instances, surfaces=surfaces, voxels=voxels)
         save_result(replace(result, instances=instances), tmp_path / "out", {})

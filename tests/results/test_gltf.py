@@ -45,10 +45,11 @@ def test_leaves_say_their_numbers_and_no_others() -> None:
         "num_views": Measurement(4.0, float("nan"), "masks"),
         "azimuth": missing("up is not known"),
     }
-    leaf = LeafTraits(leaf=12, numbers=numbers, method="surface", reasons=("one", "two"), rejection=None)
+    doubts = {"first": "one", "second": "two"}
+    leaf = LeafTraits(leaf=12, numbers=numbers, method="surface", reasons=doubts, rejection=None)
     traits = Traits(plant="basil", unit="mm", leaves=(leaf,), whole={}, up=None)
     assert leaf_extras(traits) == {"leaf_012": {
-        "leaf": 12, "unit": "mm", "method": "surface", "quality": "one; two",
+        "leaf": 12, "unit": "mm", "method": "surface", "use": "look", "quality": "one; two",
         "traits": {"area": 1234.57, "num_views": 4}, "sd": {"area": 12.3457},
     }}  # fmt: skip
     assert leaf_extras(None) == {}

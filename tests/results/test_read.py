@@ -77,9 +77,9 @@ def rich(balls: Result) -> Result:
     report = MatchReport("nview", True, 2, 0.75, torch.tensor([0.5, math.nan, 0.25, 1.0]))
     matching = replace(balls.matching, masks=masks, report=report)
     doubtful = make_surface(bent_blade().coefficients.numpy() + 3, is_oriented=False, iou=0.8)
-    doubtful = replace(doubtful, quality=Quality(("seen from one side", "frayed")))
+    doubtful = replace(doubtful, quality=Quality({"one_sided": "seen from one side", "frayed": "frayed"}))
     assert balls.voxels is not None
-    surfaces = {1: bent_blade(), 2: doubtful, 3: LeafSurface.none(torch.tensor([0]), "seen in one view only")}
+    surfaces = {1: bent_blade(), 2: doubtful, 3: LeafSurface.none(torch.tensor([0]), "test", "seen in one view only")}
     scene = replace(balls.scene, up=(0.0, 0.6, 0.8))
     config = TraitsConfig(min_sure_views=0, min_visible_share=0, min_quality=0.9, leaves_only=False)
     voxels = {1: balls.voxels[1]}
@@ -313,7 +313,7 @@ def test_broken_cameras_are_named(saved: Path, change: Callable[[Any], object], 
         (lambda r: with_masks(r, instance_ids=r.masks.instance_ids.flip(0)), r"instance_ids\[0\]"),
         (lambda r: with_masks(r, match_scores=r.masks.match_scores - 0.01), r"match_scores\[0\]: "),
         (lambda r: with_surface(r, coefficients=bent_blade().coefficients + 1), r"surfaces\[1\]\[coefficients\]"),
-        (lambda r: with_surface(r, quality=Quality(("torn",))), r"surfaces\[1\]\[quality\]"),
+        (lambda r: with_surface(r, quality=Quality({"torn": "torn"})), r"surfaces\[1\]\[quality\]"),
         (lambda r: replace(r, instances=replace(r.instances, traits=None)), "traits"),
         (lambda r: replace(r, fates=()), r"outcome\[1\]"),
     ],

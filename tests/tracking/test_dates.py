@@ -18,6 +18,7 @@ from mvseg.tracking.dates import Number, date_of, name_apart, order_dates, read_
 from mvseg.tracking.numbers import SIGHTS
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.nodes import UNCLEAR, Node, Stem, thin_tube
 from tests.plants_over_days import fit_blade, grow_blades, see, write_result
 
 
@@ -156,7 +157,7 @@ def test_what_is_no_result_with_surfaces_is_refused(tmp_path: Path) -> None:
 def test_results_in_memory() -> None:
     surface = make_surface(fit_blade(grow_blades(1, 1)[1]))
     numbers = {"length": Measurement(80.0, 2.0, "surface"), "area": missing("no surface")}
-    seen = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons=(), rejection=None)
+    seen = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons={}, rejection=None)
     none = replace(seen, leaf=2, numbers={})
     traits = Traits("p", "mm", (seen, none), {"total_leaf_area": Measurement(5.0, 1.0, "surface")}, up=(0, 0, 1))
     result: Any = SimpleNamespace(scene=SimpleNamespace(name="p"), traits=traits, surfaces={1: surface}, voxels={})
@@ -165,5 +166,14 @@ def test_results_in_memory() -> None:
     assert date.shaped == [0]
     assert date.leaves[0].numbers == {"length": Number(80.0, 2.0, "mm")}
     assert date.whole["total_leaf_area"].unit == "mm^2"
+    angle, nothing = Measurement(137.5, 4.0, "leaf bases"), missing("the lowest one")
+    node = Node(2, 1, (0, 0, 1), (0, 1, 1), height=angle, internode=Measurement(9.0, 1.0, "leaf bases"),
+                divergence=angle, insertion_angle=nothing, azimuth=nothing)  # fmt: skip
+    stem = Stem(1, thin_tube([(0, 0, 0), (0, 0, 1)]), "leaf bases", (node,), UNCLEAR)
+    result.traits = replace(traits, stems=(stem,))
+    on_stem, elsewhere = date_of(result, 3).leaves
+    assert (on_stem.node, elsewhere.node) == ((1, 2), None)
+    assert on_stem.numbers["internode"] == Number(9.0, 1.0, "mm")
+    assert on_stem.numbers["divergence"] == Number(137.5, 4.0, "degree")
     with pytest.raises(InputError, match="p: has ids but no surfaces"):
         date_of(SimpleNamespace(scene=result.scene, traits=None), 3)  # type: ignore[arg-type]

@@ -44,9 +44,23 @@ def test_births_deaths_and_gaps() -> None:
     assert states[2] == [(0, "seen"), (1, "seen"), (2, "seen"), (3, "seen")]
     assert states[5] == [(0, "seen"), (1, "hidden"), (2, "seen"), (3, "seen")]
     assert states[10] == [(2, "born"), (3, "seen")]
-    assert of_leaf[10] == 10  # in the order of appearance
     linked = [row.probability for row in tracks.rows if row.date > 0 and row.state == "seen"]
     assert min(linked) > 0.9
+
+
+def test_tracks_are_numbered_from_below() -> None:
+    """However the leaves of a date are numbered, and whichever appeared first."""
+    upper = dict(sorted(BLADES.items(), key=lambda item: -float(item[1][0, 1, 2]))[:6])
+    dates = [see(blades, day)[0] for day, blades in enumerate((upper, BLADES))]
+    for seen in (dates, [replace(date, leaves=date.leaves[::-1]) for date in dates]):
+        tracks = track_leaves(seen)
+        midribs = {leaf.leaf: leaf.midrib for leaf in tracks.dates[1].leaves}
+        rows = [row for row in tracks.rows if row.date == 1 and row.leaf is not None]
+        heights = [float(midribs[row.leaf][0, 2]) for row in rows]  # type: ignore[index]
+        assert [row.track for row in rows] == [*range(1, 11)]
+        assert heights == sorted(heights)
+    unknown = track_leaves([replace(date, knows_up=False) for date in dates])
+    assert [row.track for row in unknown.rows if row.date == 0] == [*range(1, 7)]  # in the order of appearance
 
 
 @pytest.mark.parametrize(("num_hidden", "num_tracks"), [(2, 10), (3, 11)])

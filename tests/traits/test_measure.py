@@ -65,7 +65,7 @@ def test_every_leaf_has_every_trait(traits: Traits) -> None:
     assert all([*leaf.numbers] == names for leaf in traits.leaves)
     assert traits.whole.keys() == {trait.name for trait in PLANT_TRAITS}
     for leaf in traits.leaves:
-        assert (leaf.method, leaf.reasons, leaf.rejection) == ("surface", (), None)
+        assert (leaf.method, leaf.use, leaf.quality, leaf.rejection) == ("surface", "yes", "good", None)
         missing = {name for name, number in leaf.numbers.items() if not number.exists}
         assert missing == {"mean_red", "mean_green", "mean_blue", "greenness_index", "senescent_share", "hue", "volume",
                            "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_pieces"}  # fmt: skip
@@ -94,17 +94,17 @@ def test_ids_may_be_permuted(traits: Traits) -> None:
 
 def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     matching, surfaces = make_inputs([1, 2, 3, 4])
-    surfaces[2] = LeafSurface.none(torch.arange(3), "its masks agree on no point")
-    surfaces[4] = LeafSurface.none(torch.arange(1), "seen in one view only")
-    surfaces[3] = replace(surfaces[3], quality=Quality(("seen in two views only",)))
+    surfaces[2] = LeafSurface.none(torch.arange(3), "no_common_point", "its masks agree on no point")
+    surfaces[4] = LeafSurface.none(torch.arange(1), "one_view", "seen in one view only")
+    surfaces[3] = replace(surfaces[3], quality=Quality({"two_views": "seen in two views only"}))
     traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
     good, voxels, doubted, nothing = traits.leaves
     assert [leaf.method for leaf in traits.leaves] == ["surface", "voxels", "surface", "none"]
-    assert good.reasons == ()
-    assert doubted.reasons == ("seen in two views only",)
+    assert (good.use, good.reasons) == ("yes", {})
+    assert (doubted.use, doubted.quality) == ("look", "seen in two views only")
     assert doubted.numbers["iou"].method == "surface; seen in two views only"
-    assert voxels.reasons == ("no credible surface; its masks agree on no point",)
-    assert nothing.reasons == ("no credible surface; seen in one view only",)
+    assert (voxels.use, [*voxels.reasons]) == ("look", ["no_surface", "no_common_point"])
+    assert (nothing.use, nothing.quality) == ("no", "no credible surface; seen in one view only")
     assert {name for name, n in voxels.numbers.items() if n.exists} == {
         "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_pieces", "num_views", "sure_views"
     }  # fmt: skip
@@ -122,9 +122,10 @@ def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
     assert traits.rejected == {2: "few_sure_views"}
     leaf = traits.leaves[1]
-    assert leaf.reasons == ("rejected: 1 sure views, asked for are 2",)
+    assert leaf.reasons == {"few_sure_views": "rejected: 1 sure views, asked for are 2"}
+    assert leaf.use == "no"
     assert {name for name, n in leaf.numbers.items() if n.exists} == {"num_views", "sure_views", "iou"}
-    assert leaf.numbers["area"].method == leaf.reasons[0]
+    assert leaf.numbers["area"].method == leaf.quality
     assert traits.whole["number_of_leaves"].value == 3
     kept = measure_plant(
         SCENE, matching, surfaces=surfaces, voxels={}, config=TraitsConfig(min_sure_views=1)
@@ -137,18 +138,18 @@ def test_voxels_only() -> None:
     matching, _ = make_inputs([1, 2])
     traits = measure_plant(SCENE, matching, surfaces=None, voxels={1: rod()})
     first, second = traits.leaves
-    assert (first.method, first.reasons) == ("voxels", ())
+    assert (first.method, first.use, first.quality) == ("voxels", "look", "good")
     assert first.numbers["volume"].value == pytest.approx(36e-3)
     assert first.numbers["area"].method == "no surface was asked for"
     assert second.method == "none"
-    assert "no shape" in second.reasons[0]
+    assert [*second.reasons] == ["no_shape"]
     assert not traits.whole["total_leaf_area"].exists
 
 
 @pytest.mark.parametrize("asked_for", [True, False])
 def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
     matching, surfaces = make_inputs([1, 2, 3, 4])
-    surfaces[2] = LeafSurface.none(torch.arange(3), "its masks agree on no point")
+    surfaces[2] = LeafSurface.none(torch.arange(3), "no_common_point", "its masks agree on no point")
     apart = rod().votes.clone()
     apart[:, :, 1] = 0
     voxels = {2: replace(rod(), votes=apart)}
@@ -156,7 +157,7 @@ def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
     leaf = found.leaves[1]
     assert leaf.method == "voxels"
     assert leaf.numbers["num_pieces"].value == 2
-    assert leaf.reasons[-1] == "in 2 pieces"
+    assert leaf.reasons["pieces"] == "in 2 pieces"
     why = "no credible surface; its masks agree on no point" if asked_for else "no surface was asked for"
     assert leaf.numbers["iou"].method == f"{why}; in 2 pieces"
     assert leaf.numbers["area"].method == why

@@ -28,9 +28,9 @@ def traits_of(**changes: object) -> Traits:
     full |= {trait.name: missing("only for voxels") for trait in VOXEL_TRAITS}
     reason = "rejected: looks like a stem: 9 times longer than wide, 80 degrees steep"
     nothing = {trait.name: missing(reason) for trait in LEAF_TRAITS}
-    first = LeafTraits(leaf=1, numbers=full, method="surface", reasons=(), rejection=None)
+    first = LeafTraits(leaf=1, numbers=full, method="surface", reasons={}, rejection=None)
     second = LeafTraits(
-        leaf=2, numbers=nothing, method="surface", reasons=(reason, "two, three"), rejection="stem"
+        leaf=2, numbers=nothing, method="surface", reasons={"first": reason, "second": "two, three"}, rejection="stem"
     )
     whole = {trait.name: Measurement(-3.5, 0.5, "surface") for trait in PLANT_TRAITS}
     traits = Traits(plant="basil", unit="mm", leaves=(first, second), whole=whole, up=(0.0, 0.0, 1.0))
@@ -91,16 +91,19 @@ def test_units_and_accessions(long: list[dict[str, str]], tmp_path: Path) -> Non
 def test_wide_form(tmp_path: Path) -> None:
     write_wide(tmp_path / "wide.csv", traits_of())
     first, second = read(tmp_path / "wide.csv")
-    begin = ["plant", "leaf", "area", "area_sd", "length", "length_sd", "width", "width_sd", "length_width_ratio"]
-    assert [*first][:10] == [*begin, "length_width_ratio_sd"]
+    begin = ["plant", "leaf", "use", "doubts", "area", "area_sd", "length", "length_sd", "width", "width_sd"]
+    assert [*first][:12] == [*begin, "length_width_ratio", "length_width_ratio_sd"]
     assert [*first][-6:] == ["sure_views", "iou", "unit", "method", "quality", "probability"]
     write_wide(tmp_path / "chosen.csv", traits_of(), {2: 0.75})
     assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
-    assert (first["leaf"], first["quality"], second["leaf"]) == ("1", "good", "2")
-    assert second["quality"] == "; ".join(traits_of().leaves[1].reasons)
+    assert (first["leaf"], first["use"], first["doubts"], first["quality"]) == ("1", "yes", "", "good")
+    assert (second["leaf"], second["use"], second["doubts"]) == ("2", "no", "first; second")
+    assert second["quality"] == traits_of().leaves[1].quality
     numbers = traits_of().leaves[0].numbers
     assert float(first["azimuth"]) == pytest.approx(numbers["azimuth"].value, rel=1e-5)
-    assert {name for name, cell in second.items() if cell} == {"plant", "leaf", "unit", "method", "quality"}
+    assert {name for name, cell in second.items() if cell} == {
+        "plant", "leaf", "use", "doubts", "unit", "method", "quality"
+    }  # fmt: skip
     assert {first["plant"], second["plant"]} == {"basil"}
     assert "num_views_sd" not in first
 
@@ -108,7 +111,7 @@ def test_wide_form(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["=1+2", "+x", "-x", "@sum", "\t=x", "\r\n =x"])
 def test_no_text_is_a_formula(text: str, tmp_path: Path) -> None:
     numbers = traits_of().leaves[0].numbers | {"area": missing(text), "length": Measurement(-2.0, 0.5, text)}
-    leaf = LeafTraits(leaf=1, numbers=numbers, method=text, reasons=(text,), rejection=None)  # type: ignore[arg-type]
+    leaf = LeafTraits(leaf=1, numbers=numbers, method=text, reasons={"text": text}, rejection=None)  # type: ignore[arg-type]
     traits = traits_of(plant=text, unit=text, leaves=(leaf,), whole={"number_of_leaves": missing(text)})
     write_long(tmp_path / "long.csv", traits)
     write_wide(tmp_path / "wide.csv", traits)
@@ -162,3 +165,15 @@ def test_traits_of_older_versions_are_passed_over(tmp_path: Path) -> None:
     found = read_traits(long, wide, plant="basil", unit="mm", up=None)
     assert found.whole.keys() == traits.whole.keys()
     assert found.leaves[0].numbers.keys() == traits.leaves[0].numbers.keys()
+
+
+def test_columns_and_lines_of_a_leaf() -> None:
+    """As many cells in each column as there are leaves; `print` of a leaf is a line with its size."""
+    traits = traits_of()
+    columns = traits.table()
+    assert {len(cells) for cells in columns.values()} == {len(traits.leaves)}
+    assert columns["area"][0] == traits.leaves[0].numbers["area"].value
+    numbers = traits.leaves[0].numbers | {"area": Measurement(315.2, 8.1, ""), "length": Measurement(27.06, 0.61, "")}
+    leaf = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons={}, rejection=None, unit="mm")
+    assert repr(leaf) == "leaf 1: 315 +- 8 mm^2, 27.1 +- 0.61 mm long"
+    assert repr(traits.leaves[1]) == f"leaf 2: {traits.leaves[1].quality}"

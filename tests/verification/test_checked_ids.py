@@ -149,7 +149,7 @@ def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> No
 def test_an_instance_without_a_surface_keeps_its_masks(scene: tuple[Regions, Tensor]) -> None:
     """A line of one pixel, say, with the highest id of all."""
     regions, ids = scene
-    surfaces = {**LEAVES, 3: LeafSurface.none(torch.arange(6), "its masks do not tell its shape")}
+    surfaces = {**LEAVES, 3: LeafSurface.none(torch.arange(6), "test", "its masks do not tell its shape")}
     checked = check(regions, ids, surfaces)
     assert torch.equal(checked.instance_ids, ids)
     assert checked.merged == ()

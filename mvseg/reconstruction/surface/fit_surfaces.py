@@ -89,7 +89,7 @@ def fit_surfaces(
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
         if len(views) < 2:
-            surfaces[instance] = LeafSurface.none(views, "seen in one view only")
+            surfaces[instance] = LeafSurface.none(views, "one_view", "seen in one view only")
             continue
         most = most_views or SEARCH.most_views
         members = members.select(torch.isin(members.view_index, views[spread_views(cameras[views], most)]))
@@ -107,7 +107,7 @@ def fit_surfaces(
         names = {instance: each.name for instance, each in again.items()}
         _fit_new(cache.surfaces, {each.name: each for each in again.values()}, _fit_again, workers)
     for instance, each in asked.items():
-        nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "its masks agree on no point")
+        nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
         surfaces[instance] = cache.surfaces[names[instance]] if instance in names else nothing
     oriented = orient_surfaces(dict(sorted(surfaces.items())), cameras)
     return {n: cache.orient(names[n], each) if n in names else each for n, each in oriented.items()}
@@ -184,7 +184,7 @@ def instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) ->
 
 def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface]:
     return [
-        LeafSurface.none(torch.from_numpy(each.masks.views), "its masks agree on no point")
+        LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
         if fit is None
         else _surface(masks, fit, offsets=fit.offsets_px, is_judged=False)
         for each, (masks, fit) in zip(asked, _approach(asked, is_rough=True), strict=True)
@@ -272,7 +272,7 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
 def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
     """What a fit found; `offsets` (S,) are those of the first one."""
     if not np.isfinite(fit.covariance).all():
-        return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
+        return LeafSurface.none(torch.from_numpy(masks.views), "shape_unknown", "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)
     grown = np.nan_to_num(fit.offsets_px)
     drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=grown, is_blurred=False) >= 0.5
@@ -294,12 +294,12 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: boo
         surface = replace(surface, covariance=wider * surface.covariance)
     if not is_judged:
         return surface
-    return replace(surface, quality=Quality((*_judge(surface, lacking), *_judge_shape(masks, points))))
+    return replace(surface, quality=Quality(_judge(surface, lacking) | _judge_shape(masks, points)))
 
 
-def _judge_shape(masks: MaskStack, points: Floats) -> list[str]:
+def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
     """The reasons why a shape may be none that a patch can have; `points` (rows, columns, 3) of its grid."""
-    reasons, areas = [], np.linalg.norm(cell_normals(points), axis=-1).ravel()
+    reasons, areas = dict[str, str](), np.linalg.norm(cell_normals(points), axis=-1).ravel()
     centres = (points[1:, 1:] + points[1:, :-1] + points[:-1, 1:] + points[:-1, :-1]) / 4
     px = project_points(masks.px_from_world, centres).px.reshape(-1, 2)
     stack = np.arange(len(masks)).repeat(len(areas))
@@ -308,29 +308,29 @@ def _judge_shape(masks: MaskStack, points: Floats) -> list[str]:
     shown = (is_inside & is_open).sum(0) / np.maximum(is_open.sum(0), 1)
     unshown = float(areas[shown < DOUBTS.shown].sum() / areas.sum())
     if unshown > DOUBTS.most_unshown:
-        reasons.append(f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes")
+        reasons["lobed"] = f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes"
     along = np.linalg.norm(np.diff(points[:, points.shape[1] // 2], axis=0), axis=-1).cumsum()
     widths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
     places = np.append(0, along) / along[-1]
     ends = np.interp((DOUBTS.near_end, 1 - DOUBTS.near_end), places, widths) / widths.max()
     if ends.max() > DOUBTS.blunt:
-        reasons.append("one end is blunt: where the midrib ends, and so the length, is a guess")
+        reasons["blunt_end"] = "one end is blunt: where the midrib ends, and so the length, is a guess"
     return reasons
 
 
-def _judge(surface: LeafSurface, lacking: float) -> list[str]:
+def _judge(surface: LeafSurface, lacking: float) -> dict[str, str]:
     """The reasons to doubt a fit; what it lacks of one of its masks is `lacking`, as a share of the median mask."""
-    reasons = []
+    reasons = {}
     if not surface.is_credible:
-        reasons.append("no leaf, or its masks contradict each other: no single blade explains them")
+        reasons["no_blade"] = "no leaf, or its masks contradict each other: no single blade explains them"
     if len(surface.views) == 2:
-        reasons.append("seen in two views only")
+        reasons["two_views"] = "seen in two views only"
     iou = float(surface.iou.median())
     if iou < DOUBTS.least_iou:
-        reasons.append(f"the surface explains its masks badly (median IoU {iou:.2f})")
+        reasons["poor_fit"] = f"the surface explains its masks badly (median IoU {iou:.2f})"
     if iou > DOUBTS.clean_iou and lacking > DOUBTS.most_lacking:
-        reasons.append(f"one view shows more than its surface, by {100 * lacking:.0f} % of a mask")
+        reasons["shows_more"] = f"one view shows more than its surface, by {100 * lacking:.0f} % of a mask"
     share = surface.deviations[0] / surface.area
     if share > DOUBTS.most_area_share:
-        reasons.append(f"its area is uncertain by {100 * share:.0f} %")
+        reasons["uncertain_area"] = f"its area is uncertain by {100 * share:.0f} %"
     return reasons

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import Any
@@ -34,10 +34,10 @@ class Quality:
     """Is the surface to be trusted?
 
     Attributes:
-        reasons: to doubt it, in words, the gravest first; empty for a good one.
+        reasons: {code: sentence} of the reasons to doubt it, the gravest first; empty for a good one.
     """
 
-    reasons: tuple[str, ...] = ()
+    reasons: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def is_good(self) -> bool:
@@ -78,7 +78,7 @@ class LeafSurface:
         return self.__dict__ | {"_drawn": {}}
 
     @staticmethod
-    def none(views: Tensor, reason: str) -> LeafSurface:
+    def none(views: Tensor, code: str, reason: str) -> LeafSurface:
         """An instance without a surface, and why."""
         nothing = torch.full((len(views),), torch.nan, dtype=torch.float64)
         return LeafSurface(
@@ -88,7 +88,7 @@ class LeafSurface:
             residual_px=nothing,
             iou=nothing,
             is_oriented=False,
-            quality=Quality((reason,)),
+            quality=Quality({code: reason}),
         )
 
     @property

@@ -48,7 +48,8 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
         if (leaf := measured.get(instance)) is not None:
             # as in traits.csv, traits of voxels are omitted if there are none
             shown = [each for each in LEAF_TRAITS if leaf.numbers[each.name].exists or each.name not in VOXEL_NAMES]
-            about |= {"shape": leaf.method, "doubts": list(leaf.reasons), "isRejected": leaf.rejection is not None}
+            about |= {"shape": leaf.method, "use": leaf.use, "doubts": list(leaf.reasons.values())}
+            about["isRejected"] = leaf.rejection is not None
             about["traits"] = describe_numbers(leaf.numbers, shown)
         found.append(about)
     return found

@@ -5,9 +5,8 @@ const WIDE = Math.max(150, Math.min(420, Math.floor((Math.min(1330, innerWidth) 
 const DOWN = 25 * Math.PI / 180; // how steeply the plants are looked at
 let tracks = [];
 let picked = 0;
-let fromBelow = new Map();
 // `mvseg correct` has others of these.
-let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {}, labelOf = (leaf) => fromBelow.get(leaf.track) ?? "";
+let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {};
 
 function make(name, text, parent, kind) {
   const element = document.createElement(name);
@@ -50,19 +49,8 @@ function drawDate(canvas, date) {
   for (const { leaf, middle: [x, y] } of canvas.leaves) {
     if (picked && leaf.track !== picked) continue;
     pen.strokeStyle = "#fffc"; pen.fillStyle = "#000";
-    pen.strokeText(labelOf(leaf), x, y); pen.fillText(labelOf(leaf), x, y);
+    pen.strokeText(leaf.track, x, y); pen.fillText(leaf.track, x, y);
   }
-}
-
-// {track: its number from below}, by the mean height of its base; none where up is not known.
-function ranks() {
-  const heights = {};
-  for (const leaf of data.knows_up ? data.leaves.filter((each) => each.shape.length) : []) {
-    (heights[leaf.track] ||= []).push(leaf.shape[2]);
-  }
-  const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
-  const order = Object.entries(heights).sort((one, other) => mean(one[1]) - mean(other[1]));
-  return new Map(order.map(([track], index) => [Number(track), index + 1]));
 }
 
 function pickAt(canvas, event) {
@@ -152,17 +140,15 @@ function buildTable() {
   find("tracks").replaceChildren();
   const table = make("table", undefined, find("tracks")), head = make("tr", undefined, make("thead", undefined, table));
   make("th", "leaf", head);
-  make("th", "from below", head);
   data.dates.forEach((date) => make("th", date.written, head));
   const body = make("tbody", undefined, table), rows = {};
-  find("ranks").textContent = fromBelow.size ? "numbers on leaves: from below, by the mean height of the base"
-    : "leaves have no numbers from below: up is not known";
+  find("ranks").textContent = data.knows_up ? "leaves are numbered from below, by the mean height of the base; tables and CSV have the same numbers (track)"
+    : "leaves are numbered in the order of appearance (track), as up is not known";
   for (const track of tracks) {
     rows[track] = make("tr", undefined, body);
     rows[track].dataset.track = track;
     rows[track].addEventListener("click", () => pick(track));
     make("td", track, rows[track]);
-    make("td", fromBelow.get(track) ?? "", rows[track]);
     data.dates.forEach(() => make("td", "", rows[track]));
   }
   for (const leaf of data.leaves) {
@@ -277,7 +263,6 @@ function show() {
   find("summary").textContent = `${tracks.length} leaves on ${data.dates.length} dates`;
   find("warnings").replaceChildren();
   for (const sentence of data.warnings) make("li", sentence, find("warnings"));
-  fromBelow = ranks();
   captionDates();
   buildTable();
   pick(tracks.includes(picked) ? picked : 0);

@@ -8,7 +8,6 @@ class TrackWork {
     this.edits = new Edits(data.correct, []);
     onClick = (leaf) => this.click(leaf);
     onDraw = () => this.drawLinks();
-    labelOf = (leaf) => leaf.track; // as questions and edits call it
     this.links = drawing("svg", { id: "links", "aria-label": "links" });
     find("dates").append(this.links);
     new ResizeObserver(() => this.drawLinks()).observe(find("dates"));

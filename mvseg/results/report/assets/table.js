@@ -131,6 +131,7 @@ function listColumns(data) {
     return [leaf, ...chance, plain("views", "photos with a mask of the leaf", "num_views", numViews), score];
   }
   const shape = plain("shape", "what was measured", "method", (one) => one.shape);
+  const use = plain("use", "whether to use the numbers: yes, look at the leaf first, or no", "use", (one) => one.use);
   const doubts = (one) => one.doubts.join("; ");
   const quality = {
     ...plain("doubts", "reasons to doubt the numbers", "quality", (one) => doubts(one) || null),
@@ -138,7 +139,7 @@ function listColumns(data) {
     cell: (one) => element("td", { class: "text" }, doubts(one)),
     kind: "text",
   };
-  return [leaf, ...chance, ...measured, score, shape, quality];
+  return [leaf, use, ...chance, ...measured, score, shape, quality];
 }
 
 function leafCell(leaf) {
