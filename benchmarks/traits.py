@@ -3,11 +3,11 @@
 Surfaces of simulated leaves against their meshes, by family, number of views and kind of masks ("true": the visible
 parts; "degraded": with the faults of a segmenter; "detected": what the shipped detector finds in the photos; ids are
 those of the leaves that the masks show); and areas by the code of the reason to doubt them. Plants of 8 leaves, 480 x
-480, cameras on a 200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all leaves, also those
-that the quality flag doubts; leaves without a surface are counted, not averaged. Width is the simulator's without the
-teeth of the edge. "distance" is the symmetric mean distance of the two surfaces in % of the length, "inside" the share
-of true areas, lengths and widths inside their 95 % intervals, "base" the share of oriented leaves whose base is right,
-"CPU s" the processor seconds of `fit_surfaces` for each leaf.
+480, cameras on a 200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all
+leaves, also those that the quality flag doubts; leaves without a surface are counted, not averaged. Width is the
+simulator's without the teeth of the edge. "distance" is the symmetric mean distance of the two surfaces in % of the
+length, "inside" the share of true areas, lengths and widths inside their 95 % intervals, "base" the share of oriented
+leaves whose base is right, "CPU s" the processor seconds of `fit_surfaces` for each leaf.
 
 `--real FOLDER` is a scene with true label images in `truth/`: every view is left out in turn, the surfaces of the
 others are projected into it, and the mean IoU with the true masks is printed: with all that the surface covers, and

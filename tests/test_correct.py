@@ -552,13 +552,15 @@ def test_edits_that_come_while_the_whole_result_is_made_are_kept(
     theirs = first + second
 
     def run_while(happens: Callable[[], object]) -> tuple[int, Any]:
-        def run(*_: object, **__: object) -> subprocess.CompletedProcess[str]:
+        def run(_: object, tell: Callable[[str], None]) -> tuple[int, str]:
+            tell("50%: half of it")
+            assert ask(served, "GET", "state")[1]["making"] == "50%: half of it"
             happens()
             status, answer = ask(served, "POST", "whole")
             assert (status, answer["problem"]) == (409, "The whole result is being made already.")
-            return subprocess.CompletedProcess([], 0, "done\n", "")
+            return 0, ""
 
-        monkeypatch.setattr("mvseg.server.correction_server.subprocess.run", run)
+        monkeypatch.setattr("mvseg.server.correction_server.run_command", run)
         return ask(served, "POST", "whole")
 
     def save_into_the_old_folder() -> None:
@@ -567,9 +569,9 @@ def test_edits_that_come_while_the_whole_result_is_made_are_kept(
         path.write_bytes(found)
 
     save(served, first)
-    assert run_while(save_into_the_old_folder) == (200, {"said": "done"})
+    assert run_while(save_into_the_old_folder) == (200, {})
     assert json.loads(path.read_text())["edits"] == second
-    assert run_while(lambda: path.write_bytes(text_of(theirs))) == (200, {"said": "done"})
+    assert run_while(lambda: path.write_bytes(text_of(theirs))) == (200, {})
     assert json.loads(path.read_text())["edits"] == theirs
     assert ask(served, "GET", "state")[1]["isChanged"]
 
@@ -582,11 +584,12 @@ def test_a_detector_learns_beside_the_page(
     lesson, (view, at) = Lesson(monkeypatch), middle(served.corrector.opened, 0)
     runs: list[list[str]] = []
 
-    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
-        runs.append([Path(word).read_text() if word.endswith(".safetensors") else word for word in command[3:8]])
-        return subprocess.CompletedProcess([], 0, "done\n", "")
+    def run(words: list[str], _: object) -> tuple[int, str]:
+        runs.append([Path(word).read_text() if word.endswith(".safetensors") else word for word in words[:5]])
+        return 0, ""
 
-    monkeypatch.setattr("mvseg.server.correction_server.subprocess.run", run)
+    monkeypatch.setattr("mvseg.server.correction_server.run_command", run)
+    monkeypatch.setattr(OpenResult, "reopened", lambda opened: opened)
     before = wait_until_computed(served)
     assert before["learning"] == {"now": "", "isLearned": False, "seconds": 90 + 4 * 6}
     assert ask(served, "POST", "learn")[0] == 200

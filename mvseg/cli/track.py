@@ -30,7 +30,8 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--again", type=Path | None, help=help_again)
     help_times = "of each result: numbers (days) or ISO dates (2026-05-31 or 20260531)"
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
-    parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: what the names of its results begin with)")
+    help_plant = "name of the plant, with --times (default: what the names of its results begin with)"
+    parser.add_argument("--plant", type=str | None, help=help_plant)
     parser.add_argument("--out", type=Path | None, help="folder for tables and pages (--again: the same)")
     help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)

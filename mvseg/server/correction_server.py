@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -25,6 +25,17 @@ LOOK_SECONDS = 1.0  # until it looks again whether another program has changed t
 STEP_SECONDS = 1.0  # between two words of what is computed
 LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
 CHANGED = "corrections.json was changed by another program since this page was loaded."
+
+
+def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:
+    """Run `mvseg` in a process of its own: its exit code, and the last line that it told."""
+    command, said = [sys.executable, "-m", "mvseg.cli", *words], ""
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr or ():
+            if line.strip():
+                said = line.strip()
+                tell(said)
+    return process.returncode, said
 
 
 class Refused(Exception):
@@ -66,6 +77,9 @@ class Opened(Protocol):
 
     def again(self, place: Path) -> list[str]:
         """The words after `mvseg` that make all in the folder anew; they may name files written into `place`."""
+
+    def reopened(self) -> Any:
+        """The folder as it is now. Raises InputError."""
 
 
 class Learner(Protocol):
@@ -113,7 +127,7 @@ class Corrector(Generic[Kind]):
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.is_closing = False
-        self.making_whole = threading.Lock()
+        self.making_whole, self.making = threading.Lock(), ""  # what is done of it, "" for nothing
         self.own: set[str] = set()  # `name_edits` of the lists written since the whole result was begun
 
     def page(self) -> bytes:
@@ -284,6 +298,7 @@ class Corrector(Generic[Kind]):
                 "outcomes": self.outcomes,
                 "update": self.update if self.updated > after else None,
                 "learning": self._describe_learning(),
+                "making": self.making,
             }
 
     def _describe_learning(self) -> dict[str, Any] | None:
@@ -338,8 +353,8 @@ class Corrector(Generic[Kind]):
             raise Refused(HTTPStatus.CONFLICT, "The detector is learning: wait until it is done, or cancel it.")
 
     def whole(self) -> dict[str, Any]:
-        """Make the whole result with the saved edits, and with what was learned, in its place, by a process of its own,
-        and say where it is.
+        """Make the whole result with the saved edits, and with what was learned, in its place, by a process of its own;
+        `state` says how far it is. Then the page is that of the new result.
 
         Raises:
             Refused: it is being made already, or the detector learns.
@@ -357,16 +372,25 @@ class Corrector(Generic[Kind]):
                 self._write()
                 self.own = {name_edits(self.corrections.edits)}
             with TemporaryDirectory() as place:
-                words = [*self.opened.again(Path(place)), "--corrections", str(path), "--quiet"]
-                command = [sys.executable, "-m", "mvseg.cli", *words]
-                run = subprocess.run(command, capture_output=True, text=True, check=False)
+                words = [*self.opened.again(Path(place)), "--corrections", str(path)]
+                returncode, said = run_command(words, self._tell_making)
             with self.news:
                 self._write_newest()
+            if returncode:
+                raise InputError(said or "the run was stopped")
+            opened = self.opened.reopened()
+            with self.news:
+                self.opened, self.update = opened, None
+                self.wanted += 1
         finally:
+            self._tell_making("")
             self.making_whole.release()
-        if run.returncode:
-            raise InputError((run.stderr.strip().splitlines() or ["the run was stopped"])[-1])
-        return {"said": run.stdout.strip()}
+        return {}
+
+    def _tell_making(self, said: str) -> None:
+        with self.news:
+            self.making = said
+            self._notify()
 
     def _write(self) -> None:
         write_corrections(self.opened.folder / CORRECTIONS_FILE, self.corrections)

@@ -19,7 +19,7 @@ from pydantic import BaseModel, Field
 from torch import Tensor
 
 from mvseg.corrections.as_seen import name_each
-from mvseg.corrections.file import Corrections, Point, load_corrections
+from mvseg.corrections.file import Corrections, Point, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.detection.cached_detections import CachedDetections
@@ -135,6 +135,9 @@ class OpenResult:
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         """What follows from the edits, see `recompute`."""
         shown, outcomes, messages = self.recompute(corrections, is_old)
+        made_with = () if self._saved.corrections is None else self._saved.corrections.edits
+        if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
+            shown = replace(shown, instances=replace(shown.instances, traits=self._saved.traits))
         sizes = shown.scene.cameras.sizes.tolist()
         pictures = [
             picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
@@ -152,9 +155,12 @@ class OpenResult:
     @cached_property
     def _shown(self) -> tuple[Result, list[Picture]]:
         """The newest result, and a picture of each view; at first, what lies in the folder."""
-        saved = self.saved_result()
-        views = range(len(self.scene.views))
-        return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
+        masks, views = self._saved.masks, range(len(self.scene.views))
+        return self._saved, [draw_picture(self.photos(view), masks, view=view, is_whole=True) for view in views]
+
+    @cached_property
+    def _saved(self) -> Result:
+        return self.saved_result()
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
@@ -224,6 +230,10 @@ class OpenResult:
         """`mvseg infer --again`, with options by which the whole result is found by the detector of what is shown,
         whichever lies in the folder by now; its weights are written into the folder `place`."""
         return ["infer", "--again", str(self.folder.resolve()), *self._again_with(place)]
+
+    def reopened(self) -> OpenResult:
+        """The result as it is in the folder now."""
+        return OpenResult(self.folder)
 
     def _again_with(self, place: Path) -> list[str]:
         weights = self._detector if self.learned is None else self.learned[0].learned.weights

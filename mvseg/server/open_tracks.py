@@ -97,6 +97,10 @@ class OpenTracks:
         """`mvseg track --again`: the tables of all plants."""
         return ["track", "--again", str(self.folder.resolve())]
 
+    def reopened(self) -> OpenTracks:
+        """The tracks as they are in the folder now."""
+        return OpenTracks(self.folder, self.plant.plant)
+
     def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
         """What a person says, and what hinders each edit; "" for nothing."""
         links, problems = find_plant_links(corrections.edits, self.dates)

@@ -196,7 +196,7 @@ class TrackWork {
       element("h2", {}, count(edits.list.length, "edit")), element("ol", {}, ...rows),
       element("div", { class: "answers" },
         this.button("Undo", "u", () => this.undo(), { disabled: !edits.earlier.length }),
-        this.button("Write the tables", null, () => server.whole())),
+        this.button("Write the tables", null, () => { this.note = ""; server.whole(); })),
     );
     find("said").querySelector("ol").scrollTop = 1e6;
   }

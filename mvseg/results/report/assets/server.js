@@ -20,6 +20,7 @@ class Server {
     this.isStale = false; // another page has changed the edits: this one must not save over them
     work.edits.listen(() => {
       [this.unsaved, this.isComputing] = [true, true];
+      Object.assign(this.messages, { fit: "", whole: "", learning: "" }); // of what was done before
       for (const pane of work.panes) pane.draw();
       this.send();
     });
@@ -80,7 +81,7 @@ class Server {
     }
   }
 
-  hear({ number, revision, outcomes, update, problem, isComputing, isChanged, learning, doing }) {
+  hear({ number, revision, outcomes, update, problem, isComputing, isChanged, learning, doing, making }) {
     if (isChanged || !this.own.has(revision)) {
       this.isStale = true;
       const who = isChanged ? "Another program has changed corrections.json." : "Another page has changed the edits.";
@@ -94,6 +95,7 @@ class Server {
     const isOld = revision !== this.base; // it was on its way while newer edits were saved
     const isStep = !isFirst && this.isComputing && doing && !update;
     Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved || isOld });
+    if (making && !update) return this.tell({}, `Making the whole result: ${making}`);
     if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
     if (isStep && this.work.panel) return this.work.panel.showStep(doing);
     if (update) {
@@ -127,8 +129,8 @@ class Server {
   async whole() {
     this.tell({ whole: "" }, "Making the whole result\u2026");
     try {
-      const { said } = await this.ask("whole", { method: "POST" });
-      this.tell({ whole: "" }, `${said}. Its report.html has the traits.`);
+      await this.ask("whole", { method: "POST" });
+      window.location.reload(); // the page is the new result
     } catch (error) {
       this.tell({ whole: `The whole result was not made: ${error.message}` }, "");
     }
