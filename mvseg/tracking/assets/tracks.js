@@ -152,13 +152,13 @@ function buildTable() {
     data.dates.forEach(() => make("td", "", rows[track]));
   }
   for (const leaf of data.leaves) {
-    const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 2], `cell ${leaf.state}`);
+    const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 1], `cell ${leaf.state}`);
     cell.leaf = leaf;
     cell.style.background = data.colors[leaf.track];
     cell.style.opacity = leaf.p === null ? 1 : 0.25 + 0.75 * leaf.p;
     cell.title = `leaf ${leaf.leaf}, ${leaf.state}` + (leaf.p === null ? "" : `, probability ${leaf.p}`);
   }
-  for (const [date, track, state] of data.gaps) make("span", undefined, rows[track].children[date + 2], `cell ${state}`).title = state;
+  for (const [date, track, state] of data.gaps) make("span", undefined, rows[track].children[date + 1], `cell ${state}`).title = state;
 }
 
 function svg(name, settings, text) {
