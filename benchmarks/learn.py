@@ -1,12 +1,14 @@
 """What sizes and the views bring: `python benchmarks/learn.py SCENE... [--sizes 800 400] [--rounds 3]`
 
 For each scene a table: as it is; at each of --sizes, nothing learned; after one, two, three rounds (each from the
-labels of the last, whatever the agreed area says), and after one round in which a person has outlined six leaves in two
-photos each, the largest ones that are not right; his masks do not count in the figures. With --next, what the weights
-of each round find on the next plant, as they are. The agreed area (`rate_pass`, in percent of all pixels) stands beside
-what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: it
-grows by `GROWTH`. In the end: of all pairs of rows of one scene whose MV-PQ differs by `APART` or more, how many the
-agreed area orders. Weights and detections are kept in --cache.
+labels of the last, whatever the agreed area says), and after one round in which a person has outlined six leaves in
+two photos each, the largest ones that are not right; his masks do not count in the figures. With --next, what the
+weights of each round find on the next plant, as they are. The agreed area (`rate_pass`, in percent of all pixels)
+stands beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3`
+would keep: it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves
+it says how many are stems (`tube_evidence`), and E is the expected number of correct masks. In the end: of all pairs
+of rows of one scene whose MV-PQ differs by `APART` or more, how many the agreed area orders. Weights and detections
+are kept in --cache.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
+from mvseg.evaluation.truth import shown_instances
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import find_in_photos, know, look_once
@@ -42,9 +45,15 @@ from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
+from mvseg.reconstruction.stem.tube_evidence import tube_evidence
+from mvseg.traits.filters import SURELY_STEM
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
 APART = 0.02  # MV-PQ of two runs whose order counts, at least
+TABLE = (
+    "plant", "seen at", "rounds", "agreement", "agreed area", "E", "MV-PQ", "right", "false (stems)", "recall",
+    "precision", "CPU s",
+)  # fmt: skip
 HEAD = ("", "agreed area", "stays", "MV-PQ", "right", "false", "recall", "precision", "leaves", "masks", "CPU s")
 
 
@@ -81,6 +90,29 @@ def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, beg
     return area, float(row.get("MV-PQ", "nan"))
 
 
+def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
+    """A row of --table."""
+    begun = time.process_time()
+    opened = open_scene(folder, None, RunConfig(reconstruct=None))
+    plant = learn(find_in_photos(opened, cache=cache), cache=cache)
+    masks, truth = shape_leaves(plant).masks.to("cpu"), true_maps(folder, opened.scene)
+    figures, area = leaf_metrics(masks.regions, masks.instance_ids, truth), 100 * plant.agreed_area
+    chances = torch.tensor([0.0, *(plant.instances.probabilities[n] for n in range(1, masks.num_instances + 1))])
+    expected = float((chances[masks.instance_ids.clamp(min=0)] * masks.match_scores).sum())
+    of_mask = shown_instances(masks.regions, truth, count_background=False)
+    tubes = tube_evidence(masks.regions, masks.instance_ids, opened.scene.cameras, surfaces=plant.instances.starts)
+    stems = [leaf for leaf, each in tubes.items() if each.probability > SURELY_STEM
+             and not bool((of_mask[masks.instance_ids == leaf] > 0).any())]  # fmt: skip
+    area /= int(opened.scene.cameras.sizes.prod(1).sum())
+    cells = (
+        folder.resolve().name, plant.image_size, plant.learned.rounds, f"{plant.agreement:.2f}", f"{area:.2f}",
+        f"{expected:.0f}", f"{figures.mv_pq:.3f}", f"{figures.num_right} of {figures.num_right + figures.num_missed}",
+        f"{figures.num_false} ({len(stems)})", f"{figures.mask_recall:.2f}", f"{figures.mask_precision:.2f}",
+        f"{time.process_time() - begun:.0f}",
+    )  # fmt: skip
+    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+
+
 def count_ordered(runs: list[tuple[float, float]]) -> tuple[int, int]:
     """Pairs of runs of one scene, each its agreed area and MV-PQ, that the area orders as MV-PQ does; and all that
     differ by `APART` in it."""
@@ -109,12 +141,18 @@ def main() -> None:
     parser.add_argument("--image_size", type=int, default=None)
     parser.add_argument("--sizes", type=int, nargs="*", default=())
     parser.add_argument("--next", type=Path, help="folder of another plant of the same species")
+    parser.add_argument("--table", action="store_true", help="a row for each scene, as it comes")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     np.set_printoptions(precision=3)
     warnings.simplefilter("ignore", InputWarning)
     ordered = [0, 0]
+    if args.table:
+        print("| " + " | ".join(TABLE) + " |\n|" + "---|" * len(TABLE))
+        for folder in args.scenes:
+            print_as_it_comes(folder, CachedDetections(args.cache / folder.resolve().name))
+        return
     for folder in args.scenes:
         config = RunConfig(reconstruct=None, learn="off", detect=DetectConfig(image_size=args.image_size))
         opened, begun = open_scene(folder, None, config), time.process_time()

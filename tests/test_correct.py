@@ -46,9 +46,9 @@ from mvseg.runs.request import RunRequest
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
+from mvseg.server.leaf_news import tell_vanished
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, as_sentence, keep_numbers, open_alone
-from mvseg.server.vanished import tell_vanished
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene

@@ -16,6 +16,9 @@ from mvseg.detection.numbers import DETECTION
 def choose_size(see: Callable[[int], Found], first: Found) -> Found:
     """Look again and again at a smaller size, as long as the agreed area grows.
 
+    Where the views hardly agree about the best leaves so far (`DETECTION.agreement`), one size without growth ends
+    nothing yet: there, agreed areas of neighbouring sizes differ by chance.
+
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
         first: what was found at the usual size.
@@ -23,13 +26,14 @@ def choose_size(see: Callable[[int], Found], first: Found) -> Found:
     Returns:
         What was found where the agreed area is largest; of equals, at the larger size.
     """
-    best, size = first, float(first.looks[0].longest)
+    looked, size, num_misses = [first], float(first.looks[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
-        found = see(round(size))
-        if found.agreed_area <= best.agreed_area:
-            return best
-        best = found
-    return best
+        found, best = see(round(size)), max(looked, key=lambda each: each.agreed_area)
+        num_misses = 0 if found.agreed_area > best.agreed_area else num_misses + 1
+        looked.append(found)
+        if num_misses > (best.leaves.agreement < DETECTION.agreement):
+            break
+    return max(looked, key=lambda each: each.agreed_area)
 
 
 def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> Found:

@@ -108,6 +108,7 @@ class Found:
         proposals: R masks, the excessive set.
         matched: tables of masks that are matched, the sure ones first; their `labels` are rows of `proposals`.
         report: of the sure ones.
+        pixel: width of a pixel of the first look, in pixels of the photos.
         said: what there is to warn of, should it stay.
     """
 
@@ -116,12 +117,13 @@ class Found:
     proposals: Masks
     matched: tuple[Masks, ...]
     report: MatchReport
+    pixel: float
     said: tuple[Finding, ...] = ()
 
     @property
     def agreed_area(self) -> float:
         """Pixels, see `rate_pass`."""
-        return rate_pass(self.leaves.masks, self.leaves.probabilities)
+        return rate_pass(self.leaves.masks, self.leaves.probabilities, pixel=self.pixel)
 
 
 def find_leaves(
@@ -166,4 +168,6 @@ def find_leaves(
                 min_probability=config.min_probability,
                 cache=cache,
             )
-    return Found(tuple(looks), leaves, everything, tuple(matched), looks[0].sure.report)
+    sides = cameras.sizes if looks[0].boxes is None else looks[0].boxes[:, 2:] - looks[0].boxes[:, :2]
+    pixel = int(sides.max()) / looks[0].longest
+    return Found(tuple(looks), leaves, everything, tuple(matched), looks[0].sure.report, pixel)

@@ -17,6 +17,7 @@ class DetectionNumbers:
     size_step: float = 0.5**0.5  # size of a look, as a share of the one before: half of the pixels
     # Of two muskmelons of three, eight of 20 views find the best size, in a third of the time (docs/notes/detector.md).
     judging_views: int = 8  # views that choose the size, where there are twice as many or more
+    agreement: float = 0.75  # chosen: agreement of the views below which the detector does not know the leaves
     brightest: float = 1.5  # value of a pixel above which photos are not in shares of white; resampling may exceed 1
     # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
     sure_score: float = 0.3  # score of the proposals that are matched first, at least

@@ -40,7 +40,6 @@ ROUNDS = 3  # where nobody says how many; most plants gain nothing from the thir
 # Growth of the agreed area from which new weights stay. Where MV-PQ gained 0.04 or more, it grew by 1.13 to 1.23, and
 # by 1.08 where nothing was gained (docs/notes/detector.md).
 GROWTH = 1.1
-AGREEMENT = 0.75  # chosen: agreement of the views (`Leaves`) below which the detector does not know the leaves
 
 
 def learn(
@@ -98,7 +97,7 @@ def _count_rounds(plant: Plant) -> int:
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    is_sure = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not plant.agreement < AGREEMENT
+    is_sure = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not plant.agreement < DETECTION.agreement
     return 0 if is_sure and not _is_smaller(plant) else ROUNDS
 
 

@@ -79,7 +79,8 @@ class Plant:
     @property
     def agreed_area(self) -> float:
         """Pixels, see `rate_pass`."""
-        return rate_pass(self.masks, self.instances.probabilities)
+        pixel = self.longest_side / self.image_size
+        return rate_pass(self.masks, self.instances.probabilities, pixel=pixel)
 
     @property
     def longest_side(self) -> int:

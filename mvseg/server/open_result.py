@@ -40,13 +40,13 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import stack_regions
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.read import load_result
-from mvseg.results.report.correct import describe_fate
+from mvseg.results.report.correct import describe_fate, measure_angles
 from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
-from mvseg.server.vanished import tell_vanished
+from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
@@ -145,8 +145,10 @@ class OpenResult:
         ]
         before = self._shown[0]
         known = () if before.corrections is None else before.corrections.edits
-        vanished = tell_vanished(before, shown, new=[each for each in corrections.edits if each not in known])
+        new = [each for each in corrections.edits if each not in known]
+        vanished = tell_vanished(before, shown, new=new)
         news = describe_update(shown, pictures)
+        news["told"] = tell_drawn(shown, new=new, angles=measure_angles(shown))
         self._shown = shown, pictures
         yield Update(news, outcomes, vanished + messages)
         if self.opened.is_chosen:

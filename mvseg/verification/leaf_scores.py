@@ -177,9 +177,9 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
     return best, row
 
 
-def rate_pass(masks: Masks, probabilities: Mapping[int, float]) -> float:
-    """Agreed area of a pass, in pixels: the expected area of the correct masks, times the expected number of correct
-    masks of a leaf, as a share of the views.
+def rate_pass(masks: Masks, probabilities: Mapping[int, float], *, pixel: float) -> float:
+    """Agreed area of a pass, in pixels: the expected area of the correct masks, within a rim of one pixel of the
+    detector, times the expected number of correct masks of a leaf, as a share of the views.
 
     For one plant and the same views it orders sizes and weights nearly as the truth does (docs/notes/detector.md). The
     number of correct masks alone does not: a leaf in halves has twice as many. Halves mix their ids, so that each has
@@ -188,13 +188,16 @@ def rate_pass(masks: Masks, probabilities: Mapping[int, float]) -> float:
     Args:
         masks: D masks with ids whose match scores are q.
         probabilities: {instance id: P}.
+        pixel: width of a pixel of the detector, in pixels of the photos. Where it is large, edges are coarse, and views
+            agree for that alone.
     """
     num_leaves = len(masks.instance_ids[masks.instance_ids > 0].unique())
     chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
     for instance, chance in probabilities.items():
         chances[instance] = chance
     is_correct = chances[masks.instance_ids.clamp(min=0).cpu()] * masks.match_scores.cpu().double()
-    area = float((is_correct * masks.regions.areas.cpu()).sum())
+    within = (masks.regions.areas.cpu().double().sqrt() - 2 * pixel).clamp(min=0).square()
+    area = float((is_correct * within).sum())
     share = float(is_correct.sum()) / max(num_leaves * masks.regions.num_views, 1)
     return round(area * share, CHOICE.digits)
 

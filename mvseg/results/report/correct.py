@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvseg.corrections.corrected import APPLIED, PASSED, Fate
 from mvseg.corrections.doubtful import Doubt, list_doubts
@@ -38,12 +39,26 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
         "revision": name_edits(made),
         "outcomes": [describe_fate(fate) for fate in result.fates],
         "lenses": lenses,
+        "angles": measure_angles(result).tolist(),
         "views": [
             {"size": size, "lens": lens}
             for size, lens in zip(result.scene.cameras.sizes.tolist(), of_view, strict=True)
         ],
         "doubts": describe_doubts(result, pictures),
     }
+
+
+def measure_angles(result: Result) -> NDArray[np.int64]:
+    """(V, V) degrees between the directions from which two photos show the middle of the plant's surfaces; without any,
+    between the directions in which they look."""
+    cameras = result.scene.cameras.to("cpu")
+    shapes = [each for each in (result.surfaces or {}).values() if each.exists]
+    sights = -cameras.R[:, 2].numpy()
+    if shapes:
+        middle = np.mean([each.midrib.numpy().mean(0) for each in shapes], axis=0)
+        sights = cameras.centers.numpy() - middle
+    sights = sights / np.maximum(np.linalg.norm(sights, axis=1, keepdims=True), 1e-300)
+    return np.degrees(np.arccos(np.clip(sights @ sights.T, -1, 1))).round().astype(np.int64)
 
 
 def describe_fate(fate: Fate) -> str:

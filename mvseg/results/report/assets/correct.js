@@ -3,6 +3,7 @@
 const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
   u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area", t: "learn" };
 const TOOLS = ["outline", "split", "brush", "erase", "area"];
+const PARTNER = { least: 20, best: 40, most: 60 }; // degrees between two photos that are to show one leaf
 const RADIUS = { start: 12, least: 2, most: 80, step: 1.3 }; // of the brush, pixels of the screen
 
 class Work {
@@ -324,10 +325,12 @@ class Work {
     const { pane, points } = this.draft;
     if (points.length < 3) return this.discard("Nothing is left of it.");
     const wasAsked = this.doubt;
-    this.add(this.drawnEdits(pane.view, points, leaf));
+    const edits = this.drawnEdits(pane.view, points, leaf);
+    this.add(edits);
     const [first, second] = this.panes;
     if (wasAsked?.kind === "half" && pane === first && second.view !== first.view) this.drawBeside(wasAsked);
-    else if (wasAsked?.kind !== "place") this.goOn(wasAsked); // there may be more leaves
+    else if (wasAsked && wasAsked.kind !== "place") this.goOn(wasAsked); // there may be more leaves
+    else if (edits.length === 1) this.offerPartner(pane, leaf);
   }
 
   // Two outlines say what all of a leaf is.
@@ -336,6 +339,25 @@ class Work {
     [, this.active] = this.panes;
     this.take("outline");
     this.say("Now all of it in the photo on the right: the others follow.");
+  }
+
+  // A photo beside another one that is likely to show the same leaf, from another side.
+  partnerOf(view) {
+    const angles = this.data.correct.angles[view];
+    return angles.map((_, other) => other).filter((other) => other !== view)
+      .sort((one, other) => Math.abs(angles[one] - PARTNER.best) - Math.abs(angles[other] - PARTNER.best))[0] ?? view;
+  }
+
+  // After the first outline of a leaf: where to draw it again.
+  offerPartner(pane, leaf) {
+    if (leaf && this.edits.list.filter((edit) => edit.op === "outline" && edit.leaf === leaf).length > 1) return;
+    const other = this.panes.find((one) => one !== pane);
+    const apart = this.data.correct.angles[pane.view][other.view];
+    if (apart < PARTNER.least || apart > PARTNER.most) other.show(this.partnerOf(pane.view));
+    const degrees = this.data.correct.angles[pane.view][other.view];
+    const how = leaf ? `as "${leaf}"` : "and pick this outline first, or give both one name";
+    const { name } = this.data.views[other.view];
+    this.say(`Now the same leaf in photo ${name}, ${degrees}\u00b0 away, ${how}: the other photos follow.`);
   }
 
   // The outline as it was before it was fitted to the leaf.

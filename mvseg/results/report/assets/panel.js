@@ -126,7 +126,22 @@ class Panel {
       this.action("outline", "Outline a leaf", { pressed: tool === "outline" }), ...brushes,
       this.action("split", "Cut a mask in two", { pressed: tool === "split" }),
       this.action("area", "No leaves in an area", { pressed: tool === "area" })),
-    element("p", { class: "note" }, HINTS[tool ?? "draw"])];
+    element("p", { class: "note" }, HINTS[tool ?? "draw"]), ...this.apart()];
+  }
+
+  // How far the two photos are apart, which matters for outlines in both.
+  apart() {
+    const { panes, data, tool } = this.work;
+    const degrees = data.correct.angles[panes[0].view][panes[1].view];
+    if (tool !== "outline" || panes[0].view === panes[1].view) return [];
+    const isGood = degrees >= PARTNER.least && degrees <= PARTNER.most;
+    const advice = isGood ? "good for one leaf in both" : `best are ${PARTNER.least} to ${PARTNER.most}\u00b0`;
+    const other = this.work.partnerOf(this.work.active.view);
+    const show = this.button(`Show ${data.views[other].name} beside it`, null, () => {
+      panes.find((pane) => pane !== this.work.active).show(other);
+      this.work.changed();
+    });
+    return [element("p", { class: "note" }, `These photos are ${degrees}\u00b0 apart: ${advice}.`), ...(isGood ? [] : [show])];
   }
 
   draftTools() {

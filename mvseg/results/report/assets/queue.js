@@ -8,10 +8,10 @@ function askAbout(doubt, { data }) {
   const other = doubt.otherView === undefined ? null : data.views[doubt.otherView].name;
   const beside = other === null ? "" : ` Photo ${other} shows that leaf.`;
   switch (doubt.kind) {
-    case "place": return "These large places have the colour of leaves, and no mask. Outline the leaves there, each in " +
-      "two photos under one name: the others follow.";
-    case "half": return `Leaf ${doubt.leaf} may have half masks in ${count(doubt.found, "photo")}, or a leaf beside it was ` +
-      "missed: the dashed lines show what looks like it. Outline all of it, in both photos: the others follow.";
+    case "place": return `Photos ${names(doubt, data)}: large places have the colour of leaves, and no mask (dashed). Outline ` +
+      "one leaf there at a time, in two photos under one name: the others follow.";
+    case "half": return `Leaf ${doubt.leaf}, photos ${names(doubt, data)}: half of it may have no mask (dashed), or another ` +
+      `leaf was missed there. Outline the whole of leaf ${doubt.leaf} in photo ${view}, then in the photo beside it: the others follow.`;
     case "match": return other === null
       ? `Photo ${view}: no other photo shows ${leaf}. Is it a leaf?`
       : `Photo ${view}: is this ${leaf}?${beside}`;
@@ -21,10 +21,15 @@ function askAbout(doubt, { data }) {
         "Is it a leaf?";
     case "surface": return `Photo ${view}: this mask does not fit the shape of ${leaf}. Is it that leaf?${beside}`;
     case "covered": return `Photo ${view}: ${leaf} should be here. Is it this mask?${beside}`;
-    case "leaf": return `${count(doubt.outlines.length, "photo")} may show a leaf here that was not taken for one. ` +
-      "Is it a leaf?";
+    case "leaf": return `Photos ${names(doubt, data)} may show a leaf here (dashed) that was not taken for one. Is it a leaf?`;
     default: return `Photo ${view}: ${leaf} should be here, where no mask is. Is it inside the dashed line?${beside}`;
   }
+}
+
+// Of the first photos that a question is about.
+function names(doubt, data) {
+  const views = [...new Set(doubt.outlines.map((one) => one.view))].map((view) => data.views[view].name);
+  return views.slice(0, 3).join(", ") + (views.length > 3 ? ` and ${views.length - 3} more` : "");
 }
 
 // The answers that make sense: [action, text on its button].

@@ -102,7 +102,7 @@ class Server {
       this.isNewer ||= !isFirst;
       this.work.update(update);
     }
-    const done = update || !problem ? "What you see follows from all edits." : "";
+    const done = update?.told?.join(" ") || (update || !problem ? "What you see follows from all edits." : "");
     const later = learning?.now ? "Edits are saved, and computed when the detector has learned." : "";
     this.tell({ state: problem }, later || (isComputing ? `Computing${doing ? `: ${doing}` : " what follows from the edits"}\u2026` : done));
   }
