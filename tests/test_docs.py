@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import re
 import shutil
@@ -103,6 +104,16 @@ def test_every_public_name_is_on_the_page() -> None:
     listed = re.findall(r"^::: mvseg\.(\w+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(listed) == sorted(set(mvseg.__all__) - {"__version__"})
     assert set(mvseg.matching.__all__) <= set(listed)
+
+
+def test_the_reference_says_in_a_line_what_each_name_does() -> None:
+    """For those who read it without a build; the first sentence of its docstring."""
+    page = (DOCS / "api.md").read_text(encoding="utf-8")
+    for name in re.findall(r"^::: mvseg\.(\w+)$", page, re.MULTILINE):
+        text = (inspect.getdoc(getattr(mvseg, name)) or "").strip()
+        first = re.split(r"\n\n|(?<=[.])\s+(?=[A-Z])", text, maxsplit=1)[0].rstrip(".:;")
+        first = first.replace("\n", " ").replace("|", "\\|")
+        assert f"| `{name}` | {first} |" in page
 
 
 # Names of other programs and files, examples of names, and columns of which the code has the first part only.

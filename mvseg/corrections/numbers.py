@@ -57,7 +57,8 @@ class DoubtNumbers:
     opening: int = 5  # width of a place in these pixels, at least: stems are thinner, and seams beside masks
     compact: float = 0.25  # square of its largest width, as a share of its area, at least: stems have less
     beside: int = 3  # distance between a mask and what it leaves out of its leaf, in these pixels, at most
-    most_share: float = 0.2  # size of a place, as a share of the photo, at most: what is larger is the ground
+    most_share: float = 0.2  # size of a place, as a share of the photo, at most; of what is larger, its widest place
+    widest: float = 1.5  # chosen: reach of that place from its middle, in radii of the largest circle in it
 
 
 EDITS = EditNumbers()

@@ -37,8 +37,8 @@ class Unmasked:
 
 def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list[Unmasked]:
     """The parts of at least `least_area` pixels, by view; none where nothing is matched, whose colours tell what leaves
-    look like. What is long and thin like a stem is left out, and so is what reaches the edge of the photo: it rather
-    lies behind the plant.
+    look like. What is long and thin like a stem is left out. Of what is very large, or reaches the edge of the photo,
+    its widest place counts: several leaves hang together there, or the ground.
 
     Args:
         masks: D masks on the CPU, matched.
@@ -66,7 +66,11 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
             continue
         is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
         if not is_inside or area > DOUBTS.most_share * rows.size:
-            continue
+            labels = np.where(_widest_place(labels == label), label, np.where(labels == label, 0, labels))
+            left, top, wide, high = cv2.boundingRect((labels == label).astype(np.uint8))
+            area = int((labels == label).sum())
+            if area * step**2 < least_area:
+                continue
         box = np.s_[max(top - beside, 0) : top + high + beside, max(left - beside, 0) : left + wide + beside]
         part = (labels[box] == label).astype(np.uint8)
         if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < DOUBTS.compact * area:
@@ -82,3 +86,13 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
             area=float(area * step**2),
             outline=np.asarray((outline + corner + 0.5) * step, np.float64),
         )
+
+
+def _widest_place(part: Bools) -> Bools:
+    """(h, w) of a part, what lies around the middle of its largest circle, up to `DOUBTS.widest` radii away."""
+    distance = cv2.distanceTransform(np.pad(part.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(distance.argmax()), part.shape)
+    rows, columns = np.ogrid[: part.shape[0], : part.shape[1]]
+    near: Bools = np.hypot(rows - row, columns - column) <= DOUBTS.widest * distance[row, column]
+    place: Bools = part & near
+    return place

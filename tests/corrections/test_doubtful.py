@@ -228,3 +228,19 @@ def test_what_changes_more_masks_is_asked_first() -> None:
     found = list_doubts(masks, None, cameras=CAMERAS)
     assert [each.kind for each in found] == ["few", "match"]
     assert found[0].doubt < found[1].doubt
+
+
+def test_the_widest_place_of_leaves_that_hang_together_is_asked_about() -> None:
+    """A leaf without masks, on a band of its colour that leaves the photo."""
+    bare = [np.where(labels > 1, labels, 0) for labels in TRUE]
+    photos = []
+    for labels, photo in zip(TRUE, PHOTOS, strict=True):
+        painted = photo.copy()
+        row = int(np.nonzero(labels == 1)[0].mean())
+        painted[row - 4 : row + 4][labels[row - 4 : row + 4] == 0] = GREEN
+        photos.append(painted)
+    found = list_doubts(masks_of(bare), None, cameras=CAMERAS, photos=photos.__getitem__)
+    assert found[0].kind in ("place", "half")  # it lies beside another leaf
+    for view, outline in found[0].outlines:
+        inside = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline).astype(np.int32)], 1) > 0
+        assert (TRUE[view][inside] == 1).mean() > 0.5
