@@ -39,6 +39,8 @@ class RunConfig:
             out.
         categories: names of the categories whose masks are taken, with commas between them ("leaf,petiole"), where the
             masks have categories; None for all.
+        stem_category: name of the category whose masks show stems, with `categories` for those of leaves. Stems get
+            ids and nodes, but do not count as leaves. None: no category does.
     """
 
     detect: DetectConfig = DetectConfig()
@@ -54,6 +56,7 @@ class RunConfig:
     report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"
     categories: str | None = None
+    stem_category: str | None = None
 
     def __post_init__(self) -> None:
         if isinstance(self.learn, int) and self.learn < 1:
@@ -64,6 +67,9 @@ class RunConfig:
             raise InputError(f"scale is {self.scale:g}, expected a positive number")
         if self.up is not None and not isinstance(self.up, str) and not 0 < math.hypot(*self.up) < math.inf:
             raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")
+
+        if self.stem_category is not None and self.categories is None:
+            raise InputError("stem_category is given without categories, expected the names of those of leaves, too")
 
     @property
     def category_names(self) -> list[str]:

@@ -212,6 +212,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "split_merged": False,
         "coco_crowd": "mask",
         "categories": None,
+        "stem_category": None,
         "reconstruct": {
             "shape": "voxels",
             "threshold": 0.4,
@@ -819,6 +820,19 @@ def test_categories_are_selected(plant: Path, tmp_path: Path, capsys: pytest.Cap
         assert "categories" not in captured.err
     assert main(arguments) == 0
     assert "masks of 2 categories are taken alike (8 leaf, 4 flower pot)" in capsys.readouterr().err
+    again = [str(tmp_path / "stems") if word == str(tmp_path / "out") else word for word in arguments[1:]]
+    infer = ["infer", *again, "--stem_category", "flower pot", *COARSE]
+    assert main([*infer, "--categories", "leaf"]) == 0
+    capsys.readouterr()
+    result = mvseg.load_result(tmp_path / "stems")
+    of_stems = set(result.masks.instance_ids[result.masks.classes == 2].tolist()) - {-1}
+    assert {leaf for leaf, kind in result.traits.rejected.items() if kind == "stem"} == of_stems
+    of_leaves = set(result.masks.instance_ids[result.masks.classes == 1].tolist()) - {-1}
+    assert of_stems
+    assert of_leaves
+    assert not of_stems & of_leaves
+    assert main(infer) == 2
+    assert "stem_category is given without categories" in complaint(capsys)
     assert main([*arguments, "--categories", "pot"]) == 2
     assert "there is no category 'pot', expected of these: leaf, flower pot" in complaint(capsys)
 

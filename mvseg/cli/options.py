@@ -115,6 +115,8 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_argument("--views", type=int | Literal["all"] | None, help=help_views)
     help_learn = "rounds in which the views teach the detector; auto: where it does not know the species"
     parser.add_argument("--learn", type=int | bool | Literal["auto", "off"], default="auto", help=help_learn)
+    help_stem = "category of the masks of stems, beside --categories of leaves: they count as no leaves"
+    parser.add_argument("--stem_category", type=str | None, help=help_stem)
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")
@@ -127,7 +129,7 @@ def add_run_options(parser: ArgumentParser) -> None:
 
 def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
-    plain = ("views", "scale", "unit", "split_merged", "report", "coco_crowd", "categories")
+    plain = ("views", "scale", "unit", "split_merged", "report", "coco_crowd", "categories", "stem_category")
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
         match=build_options(MatchConfig, args.match, "match."),

@@ -12,6 +12,7 @@ from mvseg.corrections.settle import settle
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding, Values, keep_causes
+from mvseg.pipeline.open_scene import STEM_CLASS
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Result
 from mvseg.system.running import timed
@@ -147,6 +148,8 @@ def measure(result: Result, config: RunConfig) -> Result:
     regions, ids, cameras = result.masks.regions, result.masks.instance_ids, result.scene.cameras
     with timed("voxels"):
         voxels = reconstruct_voxels(regions, ids, cameras, config=config.reconstruct, surfaces=result.surfaces)
+    has_stems = config.stem_category is not None
+    stems = ids[result.masks.classes == STEM_CLASS].unique().tolist() if has_stems else ()
     with timed("measure"):
         traits = measure_plant(
             result.scene,
@@ -155,5 +158,6 @@ def measure(result: Result, config: RunConfig) -> Result:
             voxels=voxels,
             photos=result.photos,
             config=config.traits,
+            stems=[instance for instance in stems if instance > 0],
         )
     return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits))

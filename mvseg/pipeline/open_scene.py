@@ -31,6 +31,8 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
 from mvseg.traits.up import place_scene
 
+STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
+
 
 @dataclass(frozen=True, eq=False)
 class Opened:
@@ -108,12 +110,17 @@ def open_scene(
         check_photos(scene)
         check_baselines(scene.cameras)
         photos = photos.select(scene, taken.tolist())
+        if masks is None and config.stem_category is not None:
+            raise InputError("stem_category names a category of given masks, and there are none (--masks)")
         if masks is None:
             require_photos(scene, folder)
             inputs |= _hash_weights(config)
             return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config, inputs=inputs)
         found = recognise_masks(whole, masks)
         regions = read_masks(whole, found, crowd=config.coco_crowd, categories=config.category_names)
+        stems = None
+        if config.stem_category is not None:
+            stems = read_masks(whole, found, crowd=config.coco_crowd, categories=[config.stem_category])
         if before != {masks: _hash_masks(masks)}:
             raise InputError(f"{masks}: has changed while it was read, expected masks that are complete")
         if left_out:
@@ -122,6 +129,10 @@ def open_scene(
             views: Values = {"num_views": len(whole.views), "views": config.views or 0}
             warn(Finding("masks_of_other_views", str(masks), {**counts, **views}))
         given = Masks.of(regions)
+        if stems is not None:
+            stems = stems.of_views(taken) if left_out else stems
+            both = Masks.concatenate((given, Masks.of(stems, classes=torch.full((len(stems),), STEM_CLASS))))
+            given = both.select(both.view_index.argsort(stable=True))
         return Opened(scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config, inputs=inputs)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -126,6 +126,7 @@ def measure_plant(
     voxels: Voxels,
     photos: Photos | None = None,
     config: TraitsConfig = TraitsConfig(),
+    stems: Collection[int] = (),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves; on the CPU, wherever the inputs are.
 
@@ -136,6 +137,7 @@ def measure_plant(
         voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
         config: what counts as a leaf.
+        stems: ids of instances that are stems, as the user says.
 
     Returns:
         The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
@@ -152,24 +154,26 @@ def measure_plant(
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
-    tubes = find_tubes(surfaces or {}, masks, scene.cameras) if config.leaves_only else {}
+    tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
     rejected = find_rejected(
         shapes,
         None if frame is None else frame[2],
         config=config,
         sure_views=sure_views,
         visible_shares=visible,
-        stems={instance: each.probability for instance, each in tubes.items()},
+        stems={instance: each.probability for instance, each in tubes.items() if instance not in stems},
     )
+    rejected |= {instance: Rejection("stem", "its masks are of the category of stems") for instance in stems}
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     ground = 0.0  # heights start from the lowest point of all blades
     if frame is not None and blades:
         ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
-    stems: tuple[Stem, ...] = ()
+    found: tuple[Stem, ...] = ()
     if config.stems == "auto":
-        seen = [tubes[instance].tube for instance, why in rejected.items() if why.kind == "stem"]
-        stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
-    of_leaf = {node.leaf: node for stem in stems for node in stem.nodes}
+        seen = [each.tube for instance, each in tubes.items()
+                if instance in rejected and rejected[instance].kind == "stem" and each.tube.exists]  # fmt: skip
+        found = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
+    of_leaf = {node.leaf: node for stem in found for node in stem.nodes}
     leaves = []
     for instance in instances:
         num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
@@ -190,7 +194,7 @@ def measure_plant(
             )
         )
     whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected))
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=stems)
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=found)
 
 
 def describe_leaf(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,9 +42,18 @@ FAINTEST = 0.25  # chosen: part of an axis that views need not show
 LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
 
 
-def find_tubes(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras) -> dict[int, TubeEvidence]:
-    """{instance id: evidence that it is a stem} of those that are long enough to be one."""
-    return tube_evidence(masks.regions, masks.instance_ids, cameras, surfaces=surfaces, least_aspect=TUBE.least_aspect)
+def find_tubes(
+    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, stems: Collection[int], is_asked: bool
+) -> dict[int, TubeEvidence]:
+    """{instance id: evidence that it is a stem} of those that are `stems`, as the user says, and of the others that are
+    slender enough to be one, if that `is_asked`."""
+    regions, ids = masks.regions, masks.instance_ids
+    known = {instance: surface for instance, surface in surfaces.items() if instance in stems}
+    others = {instance: surface for instance, surface in surfaces.items() if instance not in stems}
+    found = tube_evidence(regions, ids, cameras, surfaces=known)
+    if is_asked:
+        found |= tube_evidence(regions, ids, cameras, surfaces=others, least_aspect=TUBE.least_aspect)
+    return found
 
 
 def find_stems(
