@@ -2,7 +2,7 @@
 
 For each scene a table: as it is; at each of --sizes, nothing learned; after one, two, three rounds (each from the
 labels of the last, whatever the agreed area says), and after one round in which a person has outlined six leaves in
-two photos each, the largest ones that are not right; his masks do not count in the figures. With --next, what the
+two photos each, the largest ones that are not right; these outlines do not count in the figures. With --next, what the
 weights of each round find on the next plant, as they are. The agreed area (`rate_pass`, in percent of all pixels)
 stands beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3`
 would keep: it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves
@@ -183,7 +183,7 @@ def main() -> None:
             show(f"{DRAWN} leaves of a person, learned", plant, truth, stays="", begun=begun)
             begun = time.process_time()
             corrected = apply_edits(plant, corrections)
-            show("the same, and his masks", corrected, truth, stays="", begun=begun)
+            show("the same, and these outlines", corrected, truth, stays="", begun=begun)
         ordered = [sum(pair) for pair in zip(ordered, count_ordered(runs), strict=True)]
     print(f"\nThe agreed area orders {ordered[0]} of {ordered[1]} pairs.")
 

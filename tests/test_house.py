@@ -129,6 +129,13 @@ def test_the_house_does_not_grow(place: str) -> None:
     assert lines > BUDGET[place] - SLACK, "lower the budget to what is left"
 
 
+def test_nobody_is_he() -> None:
+    """In code and in docs: the user."""
+    pages = [path for place in ("mvseg", "benchmarks") for path in (ROOT / place).rglob("*.py")]
+    pages += [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
+    assert {path.name for path in pages if re.search(r"\b(he|his|him)\b", path.read_text("utf-8"))} == set()
+
+
 def test_no_two_modules_need_each_other() -> None:
     """Inside of rooms, too, and for types alone; `__init__` of a room takes from its modules, which is no circle."""
     imports = {module: imported_modules(source, module) & MODULES.keys() for module, source in MODULES.items()}

@@ -1,4 +1,4 @@
-"""What a person says of a leaf often holds already: such a leaf stays as he saw it. Not in the paper."""
+"""Leaves that edits confirm as they are: they stay as the user saw them. Not in the paper."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def seen_ids(masks: Masks, before: Masks) -> Tensor:
 
 
 def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
-    """The leaves that a person speaks of and that are as he says: none of their masks is gone, changed, kept apart from
+    """Find the leaves that edits are about and leave as they are: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.
 
     Args:

@@ -28,7 +28,7 @@ class DetectionNumbers:
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
     plant_views: int = 3  # views of an instance that is part of the plant, at least; all where there are fewer
     plant_margin: float = 0.1  # margin around the plant, as a share of its box's longer side: missed leaves
-    least_gain: float = 1.5  # size of the plant in a second pass, in that of the first, at least, in most photos
+    least_gain: float = 1.5  # run a second pass only if it magnifies the plant by this factor (median photo)
 
 
 DETECTION = DetectionNumbers()

@@ -1,4 +1,4 @@
-"""What a person says changes masks and links them, and these are matched, and chosen, anew."""
+"""Apply the user's edits, then match and choose again."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from mvseg.verification.drawn_leaves import follow_drawn
 
 
 def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
-    """What a person says changes masks and links them, and these are matched anew, see `mvseg.corrections.apply`.
+    """Apply the user's edits (`mvseg.corrections.apply`), then match and choose again.
 
-    Edits are about masks that a person sees, see `Plant.shown`. Without any edits, all stays as it is. The reprojection
-    error is that of the masks before edits, unless a person drew more than half as many as there were.
+    Edits are about `Plant.shown`. Without any edits, the plant is returned as it is. The reprojection error is that of
+    the masks before edits, unless the user drew more than half as many as there were.
     """
     if corrections is None or not corrections.edits:
         return plant
@@ -91,7 +91,7 @@ def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant
     if plant.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
         ids_only = replace(masks, instance_ids=seen).close_gaps()
         return replace(plant, matching=plant.matching.with_masks(ids_only)), seen
-    is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else his masks tell it better
+    is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else the user's masks tell it better
     matching = match_masks(
         masks,
         plant.scene.cameras,

@@ -55,7 +55,7 @@ def learn(
     Args:
         plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
-        corrections: of a person; his masks are certain.
+        corrections: of the user, whose masks are certain.
         rounds: that a person asks for, who judges himself: so many are learned, and the last weights stay. None: as
             many as `RunConfig.learn` says, and the agreed area judges.
 

@@ -37,7 +37,7 @@ class HullNumbers:
     """The hull of a leaf, from which starts are made."""
 
     shown_share: float = 0.5  # share of the masks above which a voxel that is in them is occupied
-    seen_share: float = 0.8  # share of the views with nothing in front that show a voxel, for none to look past it
+    seen_share: float = 0.8  # min. fraction of unoccluded views that contain a voxel; below it, the voxel is removed
     cell_px: float = 6.0  # side of a cell in the photos, below which the search ends
     most_cells: int = 10_000  # limit: cells, at which it ends
     num_voxels: int = 20_000  # limit: voxels that are looked at in these cells, about

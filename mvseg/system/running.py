@@ -36,7 +36,7 @@ class Running:
         kept: {name of what it was computed from: what was computed}; None: nothing is kept.
         seconds: {stage: wall time}, see `timed`.
         is_cancelled: asked before each stage, see `timed`.
-        report: is told what is done, in words, as it goes on; None: nobody listens.
+        report: progress callback; None disables it.
         told: names of the progress bars that have a line already, where there is no terminal.
         whole: how far the command is, of which this is a part; None: nobody asks.
     """

@@ -67,12 +67,12 @@ class Chosen:
 
 @dataclass(frozen=True, eq=False)
 class Said:
-    """What a person says of D masks.
+    """Edits of the user about D masks.
 
     Attributes:
-        is_held: (D,) bool, the masks that he speaks of.
-        is_sure: (D,) bool, those of them that show a leaf, as he says.
-        leaf: (D,) int64, the leaf that each was chosen for, if it stays as he saw it; -1 elsewhere.
+        is_held: (D,) bool, whether an edit is about the mask.
+        is_sure: (D,) bool, whether an edit says that it shows a leaf.
+        leaf: (D,) int64, its leaf before the edits, if that leaf stays as it was; -1 elsewhere.
     """
 
     is_held: Bools
@@ -93,12 +93,12 @@ class Said:
 
     @property
     def is_of_others(self) -> Bools:
-        """(D,) whether he says that a mask shows none of the leaves that he changed."""
+        """(D,) whether an edit says that the mask shows none of the leaves that edits changed."""
         return self.is_held & (~self.is_sure | (self.leaf > 0))
 
     def candidates_as_seen(self, q: Floats, is_taken: Bools) -> Ints:
-        """(D,) the candidate that each held mask of a leaf that stays shows, -1 for the other masks: of those that were
-        taken (K,), the one that all masks of the leaf show best by q (D, K); of all, where none of these shows it."""
+        """Candidate of each mask (D,) of a leaf that stays and that an edit is about, -1 for the others: the one that
+        all masks of the leaf show best by q (D, K). Accepted candidates (K,) first, then all."""
         found = np.full(len(q), -1)
         leaves = np.unique(self.leaf[self.is_held & (self.leaf > 0)])
         if len(leaves):

@@ -46,8 +46,8 @@ class Leaves:
 
     Attributes:
         masks: D' masks on the CPU, by view and instance, with ids from 1 on, the likeliest leaf first; match scores are
-            q, and `labels` of proposals their rows. At most one of each leaf in a view, but for those of a person; his
-            that show no leaf have -1.
+            q, and `labels` of proposals their rows. At most one of each leaf in a view, but for those of the user;
+            of these, the ones that show no leaf have -1.
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
         left: the candidates that were not chosen, the most likely first.
@@ -78,8 +78,8 @@ def choose_leaves(
 
     Masks that a person corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
     that no detector found. What else lies there goes, and what the person took away does not come back. All other
-    candidates are those without him: what he says of one leaf changes no other, unless they compete for masks. Where
-    all that he says of a leaf holds already, its candidate is one of these.
+    candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. Where
+    all that edits say of a leaf holds already, its candidate is one of these.
 
     Args:
         matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
@@ -103,7 +103,7 @@ def choose_leaves(
     seen = torch.full_like(matched.instance_ids, -1) if seen is None else seen.cpu()
     ids, origin, stays = matched.instance_ids, matched.origin, seen > 0
     is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
-    is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # he only says which leaf it does not show
+    is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # an edit only says which leaf it does not show
     is_sure = is_held & ~is_apart
     is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # a person's, and what was cut since
     added = matched.select(is_added)

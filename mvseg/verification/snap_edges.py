@@ -22,7 +22,8 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
 from mvseg.verification.numbers import SNAP
 
-FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
+# confirmed masks are snapped too: the user saw them with the snapped edge
+FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])
 
 Pixels = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
