@@ -178,10 +178,10 @@ def test_numbers_go_to_most_pixels_and_new_leaves_get_new_ones() -> None:
     first = replace(masks, instance_ids=masks.regions.labels.clone())
     scene = Scene("maps", tuple(View(name, Path(name)) for name in "abc"), room_cameras(3))
 
-    def keep(masks: Masks) -> list[int]:
+    def keep(masks: Masks, shown: Masks | None = None) -> list[int]:
         instances = Instances(probabilities={int(id): float(id) for id in masks.instance_ids.unique() if id > 0})
         result = Result(scene=scene, matching=Matching(masks, MatchReport("test")), instances=instances)
-        kept = keep_numbers(result, plant)
+        kept = keep_numbers(result, plant, shown)
         for old, new in zip(masks.instance_ids.tolist(), kept.masks.instance_ids.tolist(), strict=True):
             assert old < 0 or kept.instances.probabilities[new] == old
         return kept.masks.instance_ids.tolist()
@@ -195,6 +195,14 @@ def test_numbers_go_to_most_pixels_and_new_leaves_get_new_ones() -> None:
     apart = replace(first, instance_ids=torch.arange(1, 10))
     assert len(set(keep(apart))) == 9
     assert max(keep(apart)) == 10  # 2 was given, and is nobody's any more
+    for labels in maps:  # as another detector sees them
+        labels[0, 0] = labels[0, 8] = labels[8, 0] = 0
+    regions = regions_from_label_maps(maps)
+    others = Masks.of(regions, 4 - regions.labels)
+    plant = {}
+    assert keep(first) == first.instance_ids.tolist()
+    assert keep(others, shown=first) == regions.labels.tolist()
+    assert set(keep(others)) == {*regions.labels.tolist()}
 
 
 def test_a_page_that_knows_all_waits_for_news(served: CorrectionServer) -> None:

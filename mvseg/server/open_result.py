@@ -50,6 +50,7 @@ from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
+from mvseg.verification.numbers import EVIDENCE
 
 MOST_CORNERS = 10_000
 
@@ -198,7 +199,7 @@ class OpenResult:
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(plant, corrections)
             result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
-        shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
+        shown = keep_numbers(replace(result, corrections=corrections), self._numbers, self._shown[0].masks)
         told = {"edit", *(each.get("code") for each in self.run.said.findings)}
         new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]
@@ -307,16 +308,29 @@ def _read_detector(folder: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def keep_numbers(result: Result, known: dict[str, int]) -> Result:
-    """The result whose leaves have the numbers that most of their masks' pixels had last; the others get new ones, in
-    their order. So ids may have gaps. `known`, {name of a mask: number of its leaf}, learns them."""
+def keep_numbers(result: Result, known: dict[str, int], shown: Masks | None = None) -> Result:
+    """Give leaves the numbers that most of their masks' pixels had last, and the others new ones, in their order. So
+    ids may have gaps.
+
+    Args:
+        result: with ids of its own.
+        known: {name of a mask: number of its leaf}; learns those of the result.
+        shown: masks that the page shows, with their numbers: a mask without a known name, as a detector that has
+            learned finds it, votes for the leaf of the mask that it covers (`EVIDENCE.fits`). None: there are none.
+    """
     masks = result.masks
-    named = [(int(id), int(area), name) for id, area, name in
-             zip(masks.instance_ids, masks.regions.areas, name_each(masks.regions), strict=True) if id > 0]  # fmt: skip
+    names, ids, areas = name_each(masks.regions), masks.instance_ids.tolist(), masks.regions.areas.tolist()
+    named = [(ids[row], areas[row], name, row) for row, name in enumerate(names) if ids[row] > 0]
     votes = Counter[tuple[int, int]]()
-    for instance, area, name in named:
+    for instance, area, name, row in named:
         if name in known:
             votes[instance, known[name]] += area
+        elif shown is not None:
+            mask = masks.regions.placed(row)
+            beside = (shown.view_index == masks.view_index[row]) & (shown.instance_ids > 0)
+            for other in beside.nonzero()[:, 0].tolist():
+                if shown.regions.placed(other).iou(mask) > EVIDENCE.fits:
+                    votes[instance, int(shown.instance_ids[other])] += area
     numbers: dict[int, int] = {}
     for instance, number in sorted(votes, key=lambda pair: (-votes[pair], pair)):
         if instance not in numbers and number not in numbers.values():
@@ -324,15 +338,15 @@ def keep_numbers(result: Result, known: dict[str, int]) -> Result:
     new = count(max(known.values(), default=0) + 1)
     for instance in sorted({each[0] for each in named} - set(numbers)):
         numbers[instance] = next(new)
-    known.update({name: numbers[instance] for instance, _, name in named})
+    known.update({name: numbers[instance] for instance, _, name, _ in named})
 
     def renumber(ids: Tensor) -> Tensor:
         return torch.tensor([numbers.get(each, -1) for each in ids.tolist()], dtype=torch.int64, device=ids.device)
 
     merged = [each for each in masks.merged if each.other in numbers]
     masks = masks.with_merged(merged)
-    ids = replace(masks, instance_ids=renumber(masks.instance_ids), second_ids=renumber(masks.second_ids))
-    return replace(result, matching=result.matching.with_masks(ids), instances=result.instances.renumber(numbers))
+    kept = replace(masks, instance_ids=renumber(masks.instance_ids), second_ids=renumber(masks.second_ids))
+    return replace(result, matching=result.matching.with_masks(kept), instances=result.instances.renumber(numbers))
 
 
 @contextmanager
