@@ -16,8 +16,8 @@ from mvseg.detection.numbers import DETECTION
 def choose_size(see: Callable[[int], Found], first: Found) -> Found:
     """Look again and again at a smaller size, as long as the agreed area grows.
 
-    Where the views hardly agree about the best leaves so far (`DETECTION.agreement`), one size without growth ends
-    nothing yet: there, agreed areas of neighbouring sizes differ by chance.
+    Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), one size without
+    growth ends nothing yet: there, agreed areas of neighbouring sizes differ by chance.
 
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
@@ -31,7 +31,7 @@ def choose_size(see: Callable[[int], Found], first: Found) -> Found:
         found, best = see(round(size)), max(looked, key=lambda each: each.agreed_area)
         num_misses = 0 if found.agreed_area > best.agreed_area else num_misses + 1
         looked.append(found)
-        if num_misses > (best.leaves.agreement < DETECTION.agreement):
+        if num_misses > (best.leaves.agreement < DETECTION.clear_agreement):
             break
     return max(looked, key=lambda each: each.agreed_area)
 

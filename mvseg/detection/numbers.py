@@ -18,6 +18,7 @@ class DetectionNumbers:
     # Of two muskmelons of three, eight of 20 views find the best size, in a third of the time (docs/notes/detector.md).
     judging_views: int = 8  # views that choose the size, where there are twice as many or more
     agreement: float = 0.75  # chosen: agreement of the views below which the detector does not know the leaves
+    clear_agreement: float = 0.85  # chosen: the same, from which one smaller size without growth ends the search
     brightest: float = 1.5  # value of a pixel above which photos are not in shares of white; resampling may exceed 1
     # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
     sure_score: float = 0.3  # score of the proposals that are matched first, at least
