@@ -99,7 +99,7 @@ def test_a_run_warns_of_it(
     edit: Callable[[int, dict[str, Any]], object], expected: str, plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     edit_cameras(plant, edit)
-    monkeypatch.setattr("mvseg.pipeline.finish._measure", lambda result, *_: result)  # no shape is looked at
+    monkeypatch.setattr("mvseg.pipeline.run_scene.measure", lambda result, *_: result)  # no shape is looked at
     config = RunConfig(reconstruct=ReconstructConfig(shape="voxels"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)

@@ -193,7 +193,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert [each["code"] for each in run["findings"]] == ["no_masks"]
-        ran = {"views", "match", "split_merged", "coco_crowd", "categories", "report"}
+        ran = {"views", "match", "split_merged", "coco_crowd", "categories", "stem_category", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"

@@ -278,7 +278,7 @@ def test_the_options_are_those_of_infer(tmp_path: Path) -> None:
     words = ["--config", str(tmp_path / "run.yaml"), "--detect.min_score", "0.4", "--reconstruct.shape", "voxels"]
     words += ["--traits.leaves_only", "false", "--scale", "2", "--up", "0 0 1"]
     words += ["--split_merged", "true", "--coco_crowd", "ignore", "--report", "false"]
-    words += ["--views", "12", "--learn", "2"]
+    words += ["--views", "12", "--learn", "2", "--stem_category", "stem"]
     infer, both = (build_run(build_parser().parse_args([verb, "x", *words])[verb]) for verb in ("infer", "batch"))
     assert infer == both
     assert (both.match.seed, both.unit, both.scale, both.up) == (4, "cm", 2, (0, 0, 1))
