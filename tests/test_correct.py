@@ -25,12 +25,12 @@ from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.corrections.as_seen import name_each
-from mvseg.corrections.file import FORMAT, Corrections, Reject, load_corrections, name_edits, parse_corrections
+from mvseg.corrections.file import FORMAT, Corrections, Outline, Reject, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
-from mvseg.masks import Masks
+from mvseg.masks import Masks, Origin
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.finish import shape_leaves
@@ -46,7 +46,7 @@ from mvseg.runs.request import RunRequest
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
-from mvseg.server.leaf_news import tell_vanished
+from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, as_sentence, keep_numbers, open_alone
 from mvseg.system.running import Cancelled
@@ -678,6 +678,30 @@ def test_a_leaf_that_goes_with_an_edit_of_another_is_named(served: CorrectionSer
     assert tell_vanished(shown, without(other), new=edits) == [
         f"Leaf {other} ({int((ids == other).sum())} masks) went with your last edit: undo it if that is wrong."
     ]
+
+
+@pytest.mark.parametrize(
+    ("drawn", "stays", "apart", "end"),
+    [
+        ("ab", "abc", 30, "drawn in 2 photos, found in 1 of 2 others."),
+        ("ab", "ab", 6, "others: they are 6 degrees apart. Outline it in a photo 20 to 60 degrees away, too."),
+        ("ab", "ab", 40, "others: its shape fits no other photo. Outline it in a photo 20 to 60 degrees away, too."),
+        ("a", "a", 0, "of 3 others: one photo tells no shape. Outline it in a photo 20 to 60 degrees away, too."),
+    ],
+)
+def test_outlines_say_where_their_leaf_was_found_or_why_not(drawn: str, stays: str, apart: int, end: str) -> None:
+    maps = [np.kron([[int(name in stays), 0], [0, 2]], np.ones((4, 4), int)) for name in "abcd"]
+    masks = Masks.of(regions_from_label_maps(maps))
+    is_drawn = (masks.regions.labels == 1) & torch.tensor(["abcd"[view] in drawn for view in masks.view_index.tolist()])
+    origin = torch.where(is_drawn, int(Origin.CORRECTED), int(Origin.DETECTED))
+    masks = replace(masks, instance_ids=masks.regions.labels.clone(), origin=origin)
+    scene = Scene("maps", tuple(View(name, Path(name)) for name in "abcd"), room_cameras(4))
+    result = Result(scene=scene, matching=Matching(masks, MatchReport("test")), instances=Instances())
+    new = [Outline(view=name, polygon=((0, 0), (4, 0), (4, 4))) for name in drawn]
+    (said,) = tell_drawn(result, new=new, angles=np.full((4, 4), apart))
+    assert said.startswith("Leaf 1: drawn in ")
+    assert said.endswith(end)
+    assert tell_drawn(result, new=[], angles=np.full((4, 4), apart)) == []
 
 
 def test_inputs_that_changed_or_moved_since(

@@ -219,6 +219,6 @@ def test_fitting_to_the_leaf_is_undone_alone(browser: sync_api.Browser, served: 
     assert tab.page.evaluate(points) == drawn
     assert tab.page.get_by_role("button", name="As I drew it").count() == 0
     tab.page.keyboard.press("Enter")
-    tab.wait_for(": one photo tells no shape. Outline it in a photo 20 to 60 degrees away, too.")
+    tab.wait_for("drawn in one photo, found in")
     assert tab.rows()[0].startswith("outline")
     tab.page.close()
