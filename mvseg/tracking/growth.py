@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -26,13 +26,12 @@ TRAITS = (
 )  # fmt: skip
 SIZES = ("area", "length", "width")  # get a curve, too
 NOTHING = Number(math.nan, math.nan, "")
-Heights = Mapping[int, Mapping[int, Number]]  # {track: {date: height of its base}}
 
 
 @dataclass(frozen=True)
 class GrowthPoint:
     """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours; of two
-    dates the later one has it. `reference` is the track that heights are counted by, see `level_heights`."""
+    dates the later one has it."""
 
     track: int
     trait: str
@@ -40,7 +39,6 @@ class GrowthPoint:
     number: Number
     rate: float
     rate_sd: float
-    reference: int | None = None
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,6 @@ def measure_growth(tracks: Tracks) -> Growth:
         }
         for trait in TRAITS
     }
-    found["insertion_height"], references = level_heights(found["insertion_height"])
     points: list[GrowthPoint] = []
     curves = []
     for track, trait in product(sorted(dates_of), TRAITS):
@@ -133,45 +130,10 @@ def measure_growth(tracks: Tracks) -> Growth:
             near = slice(max(place - 1, 0), place + 2)
             is_told = place > 0 or len(seen) > 2
             rates = slope(times[near], values[near], sds[near]) if is_told else (math.nan, math.nan)
-            reference = references[date] if trait == "insertion_height" else None
-            points.append(GrowthPoint(track, trait, date, number, *rates, reference=reference))
+            points.append(GrowthPoint(track, trait, date, number, *rates))
         if trait in SIZES and len(seen) >= GROWTH.least_dates:
             curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
-
-
-def level_heights(heights: Heights) -> tuple[dict[int, dict[int, Number]], dict[int, int]]:
-    """Level heights over one ground: those of the first date, and {date: its reference, a track}.
-
-    A date counts its heights from the lowest point of its own leaves, as nothing else of the plant is known there.
-    Where the lowest leaf falls, this ground rises, and all others seem to sink. So one leaf is the reference: its base
-    stays where it was on the first date, for the stem below a leaf that is open hardly stretches. Where it is gone,
-    another one that was seen with it takes over, at the height that it had then.
-
-    The reference is the leaf that the most dates from there on show; of several the lowest. The standard deviation of
-    its height is carried into those of the others. A date that shares no leaf with those before it has no heights.
-    """
-    level: dict[int, dict[int, Number]] = {track: {} for track in heights}
-    references: dict[int, int] = {}
-    for date in sorted({date for seen in heights.values() for date in seen}):
-        here = [track for track, seen in heights.items() if date in seen and (level[track] or not references)]
-        if not here:
-            continue
-        last = next(reversed(references.values()), None)
-        reference = last if last in here else min(here, key=lambda track: _rank(heights[track], date))
-        its = heights[reference][date]
-        known = next(reversed(level[reference].values()), its)
-        for track, seen in heights.items():
-            if date in seen:
-                own, sd = seen[date], seen[date].sd if not references else math.hypot(seen[date].sd, its.sd)
-                level[track][date] = replace(own, value=known.value + own.value - its.value, sd=sd)
-        level[reference][date], references[date] = known, reference
-    return level, references
-
-
-def _rank(seen: Mapping[int, Number], date: int) -> tuple[int, float]:
-    """The least one is shown by the most dates from this one on, and is low."""
-    return -sum(other >= date for other in seen), seen[date].value
 
 
 def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from mvseg.tracking.track import Tracks
 NODE_NUMBERS = ("node_height", "internode", "divergence", "insertion_angle")
 COLUMNS = {
     "tracks.csv": ("plant", "time", "scene", "leaf", "track", "probability", "state"),
-    "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd", "reference"),
+    "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd"),
     "plants.csv": (
         "plant", "time", "scene", "leaves", "born", "gone", "phyllochron", "total_area", "total_area_sd", "unit",
         "relative_growth_rate", "relative_growth_rate_sd",
@@ -41,7 +41,7 @@ def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
     for point in growth.points:
         number, time = point.number, tracks.dates[point.date].written
         measured = number.value, number.sd, number.unit, point.rate, point.rate_sd
-        add("growth.csv", point.track, point.trait, time, *measured, point.reference)
+        add("growth.csv", point.track, point.trait, time, *measured)
     for each in growth.plant:
         date, area, rate = tracks.dates[each.date], each.total_area, each.relative_growth_rate
         numbers = each.phyllochron, area.value, area.sd, area.unit, rate.value, rate.sd

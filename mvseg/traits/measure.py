@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from mvseg.errors import check_arguments
@@ -18,14 +20,15 @@ from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Kind, Rejection, find_rejected, median_iou
-from mvseg.traits.leaf import Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.leaf import NEED_UP, Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import find_stems, find_tubes
+from mvseg.traits.stems import find_stems, find_tubes, up_of_stem
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
+TILT_DEG = 10.0  # fitted: python benchmarks/stems.py --cache DIR --up; root mean square of stems against up
 NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
 GOOD = "good"
 # Codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each (docs/traits.md).
@@ -165,14 +168,18 @@ def measure_plant(
     )
     rejected |= {instance: Rejection("stem", "its masks are of the category of stems") for instance in stems}
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
-    ground = 0.0  # heights start from the lowest point of all blades
-    if frame is not None and blades:
-        ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
     found: tuple[Stem, ...] = ()
     if config.stems == "auto":
         seen = [each.tube for instance, each in tubes.items()
                 if instance in rejected and rejected[instance].kind == "stem" and each.tube.exists]  # fmt: skip
         found = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
+    tilt_deg = 0.0
+    if frame is None and (up := up_of_stem(found, blades, scene.cameras)) is not None:
+        frame, tilt_deg = level_frame(up), TILT_DEG
+    ground = extent = 0.0  # heights start from the lowest point of all blades
+    if frame is not None and blades:
+        points = np.concatenate([surface.points().numpy().reshape(-1, 3) for surface in blades.values()]) @ frame.T
+        ground, extent = float(points[:, 2].min()), float(np.ptp(points[:, :2], axis=0).max())
     of_leaf = {node.leaf: node for stem in found for node in stem.nodes}
     leaves = []
     for instance in instances:
@@ -181,7 +188,8 @@ def measure_plant(
         if instance in sure_views:
             numbers["sure_views"] = Measurement(float(sure_views[instance]), float("nan"), "matching")
         if instance in blades:
-            numbers |= measure_leaf(blades[instance], frame, ground=ground) | appearance[instance]
+            measured = measure_leaf(blades[instance], frame, ground=ground)
+            numbers |= tilt(measured, tilt_deg, extent=extent) | appearance[instance]
             numbers["node_height"] = NO_NODE
         if (node := of_leaf.get(instance)) is not None:
             numbers |= {"node_height": node.height, "insertion_angle": node.insertion_angle}
@@ -193,8 +201,19 @@ def measure_plant(
                 instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
             )
         )
-    whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected))
+    whole = tilt(measure_whole(blades, frame, num_leaves=len(instances) - len(rejected)), tilt_deg, extent=extent)
     return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=found)
+
+
+def tilt(numbers: Mapping[str, Measurement], degrees: float, *, extent: float) -> dict[str, Measurement]:
+    """The numbers, those that need up with what the stem tells of it: it leans by so many degrees (standard deviation),
+    and heights by that over half of the `extent` of the plant; unchanged for 0."""
+    found = dict(numbers)
+    for name, number in numbers.items():
+        if degrees and number.exists and name in (*NEED_UP, "height"):
+            error = degrees if DEFINITIONS[name].kind == "degree" else np.radians(degrees) * extent / 2
+            found[name] = Measurement(number.value, math.hypot(number.sd, error), f"{number.method}, up from the stem")
+    return found
 
 
 def describe_leaf(

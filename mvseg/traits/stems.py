@@ -40,6 +40,7 @@ LEAF_SHARE = 0.5  # chosen: leaves that sit on a path, of all, at least
 UPRIGHT = 0.3  # chosen: length of the mean of the directions that are up in the photos, for them to agree
 FAINTEST = 0.25  # chosen: part of an axis that views need not show
 LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
+LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter ones of seedlings lean by 20 degrees
 
 
 def find_tubes(
@@ -88,6 +89,8 @@ def find_stems(
     if tubes and (found := _of_tubes(tubes, surfaces, frame, upward)):
         return found
     axes = axes_of_bases(surfaces, upward)
+    if frame is not None:
+        axes = tuple(axis for axis in axes if _rises(axis.tube, frame[2]))
     if not photos.exist:
         return _of_bases(axes, frame)
     seen = see_plant(surfaces, masks, cameras, photos=photos)
@@ -104,6 +107,25 @@ def find_upward(cameras: Cameras) -> Floats | None:
     """(3,) the direction that is up in most photos, roughly that of the plant; None where these do not agree."""
     mean = -cameras.R[:, 1].mean(0).cpu().numpy()
     return mean / np.linalg.norm(mean) if np.linalg.norm(mean) > UPRIGHT else None
+
+
+def up_of_stem(stems: Sequence[Stem], surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Floats | None:
+    """(3,) the direction in which the only stem of a plant grows, as long as a leaf or longer, and upwards in the
+    photos; None without one."""
+    upward = find_upward(cameras)
+    if len(stems) != 1 or upward is None:
+        return None
+    first, last = stems[0].tube.points()[[0, -1]]
+    length = float(np.linalg.norm(last - first))
+    if length < LEAST_STEM * np.median([surface.length for surface in surfaces.values()]):
+        return None
+    return (last - first) / length if _rises(stems[0].tube, upward) else None
+
+
+def _rises(tube: Tube, up: Floats) -> bool:
+    """Does a stem rise more than it runs aside?"""
+    first, last = tube.points()[[0, -1]]
+    return bool(2 * ((last - first) @ up) ** 2 > ((last - first) ** 2).sum() and (last - first) @ up > 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mvseg.tracking.dates import Number, PlantOnDate
-from mvseg.tracking.growth import level_heights, measure_growth, slope
+from mvseg.tracking.growth import measure_growth, slope
 from mvseg.tracking.track import TrackRow, Tracks
 from tests.plants_over_days import grow_blades, see
 
@@ -42,17 +42,6 @@ def test_points_carry_the_numbers_of_the_results() -> None:
     assert [point.number.value for point in points] == [100, 140, 180]
     assert [point.number.sd for point in points] == pytest.approx([2, 2.8, 3.6])
     assert [point.rate for point in points] == pytest.approx([20] * 3)
-
-
-def test_heights_are_over_one_ground_when_the_lowest_leaf_falls() -> None:
-    """One leaf is the reference; where it is gone, one that was seen with it takes over."""
-    own = {1: {0: 0.0}, 2: {0: 20.0, 1: 5.0}, 3: {1: 30.0, 2: 4.0}, 4: {2: 10.0}, 5: {3: 7.0}}
-    heights = {track: {date: Number(value, 3.0, "mm") for date, value in seen.items()} for track, seen in own.items()}
-    level, references = level_heights(heights)
-    assert references == {0: 2, 1: 2, 2: 3}
-    values = {track: {date: number.value for date, number in seen.items()} for track, seen in level.items()}
-    assert values == {1: {0: 0.0}, 2: {0: 20.0, 1: 20.0}, 3: {1: 45.0, 2: 45.0}, 4: {2: 51.0}, 5: {}}
-    assert [level[track][date].sd for track, date in ((1, 0), (3, 1))] == pytest.approx([3, math.hypot(3, 3)])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,8 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.traits.config import TraitsConfig
-from mvseg.traits.measure import LeafTraits, Traits, measure_plant
+from mvseg.traits.leaf import Measurement
+from mvseg.traits.measure import LeafTraits, Traits, measure_plant, tilt
 from mvseg.traits.ontology import LEAF_TRAITS, PLANT_TRAITS
 
 CAMERAS = ring_cameras(3)
@@ -171,3 +172,14 @@ def test_unknown_up() -> None:
         assert "up is not known" in number.method
     assert traits.leaves[0].numbers["area"].exists
     assert traits.whole["convex_hull_volume"].exists
+
+
+def test_the_stem_tells_up_less_surely() -> None:
+    names = ("inclination", "area", "insertion_height", "height")
+    numbers = {name: Measurement(30.0, 3.0, "surface") for name in names}
+    assert tilt(numbers, 0.0, extent=100) == numbers
+    tilted = tilt(numbers, 4.0, extent=100)
+    assert tilted["area"] == numbers["area"]
+    assert tilted["inclination"] == Measurement(30.0, 5.0, "surface, up from the stem")
+    height_sd = np.hypot(3, 50 * np.radians(4))
+    assert [tilted[name].sd for name in ("insertion_height", "height")] == pytest.approx([height_sd] * 2)

@@ -14,13 +14,13 @@ from mvseg.masks import Masks
 from mvseg.reconstruction.stem.fit_tube import fit_tube
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
 from mvseg.reconstruction.stem.stem_path import find_path
-from mvseg.reconstruction.stem.thin_parts import find_cells, see_thin
+from mvseg.reconstruction.stem.thin_parts import ThinView, find_cells, see_thin, share_of_views
 from mvseg.reconstruction.stem.tube import Tube
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import regions_from_label_maps
 from mvseg.traits.measure import Traits
 from mvseg.traits.nodes import Stem
-from mvseg.traits.stems import find_stems
+from mvseg.traits.stems import find_stems, up_of_stem
 from mvseg.traits.table import read_nodes, write_nodes
 from mvseg.traits.up import level_frame
 from tube_scene import BENT, T, stack, tube_masks
@@ -136,6 +136,26 @@ def test_no_stem_where_leaves_do_not_agree() -> None:
     assert stems_of(strewn) == ()
 
 
+def test_a_stem_rises_more_than_it_runs_aside() -> None:
+    leaves = PLANTS["spiral"][1]
+    for lean, num_stems in ((30, 1), (60, 0)):
+        turned = {leaf: move(surface, turn_about(np.array([1.0, 0, 0]), lean)) for leaf, surface in leaves.items()}
+        assert len(stems_of(turned)) == num_stems
+
+
+@pytest.mark.parametrize("lean", [0, 20])
+def test_where_nothing_else_says_which_way_is_up_the_stem_does(lean: float) -> None:
+    turn = turn_about(np.array([1.0, 0, 0]), lean)
+    leaves = {leaf: move(surface, turn) for leaf, surface in PLANTS["spiral"][1].items()}
+    stems = stems_of(leaves, None)
+    up = up_of_stem(stems, leaves, CAMERAS)
+    assert up is not None
+    assert up @ (turn @ UP) > np.cos(np.radians(3))
+    assert up_of_stem((*stems, *stems), leaves, CAMERAS) is None
+    long = {leaf: move(surface, np.eye(3), scale=10) for leaf, surface in leaves.items()}
+    assert up_of_stem(stems, long, CAMERAS) is None
+
+
 def test_masks_of_stems_tell_better_than_leaves() -> None:
     """Upwards, with a radius, and heights from the foot."""
     cameras = ring_cameras(10)
@@ -217,6 +237,29 @@ def test_a_path_through_thin_parts_joins_leaves_to_their_stem() -> None:
     nothing = [see_thin(np.full((SIZE, SIZE, 3), 150, np.uint8), np.zeros((SIZE, SIZE), bool), matrix, points)
                for matrix in cameras.px_from_world.numpy()]  # fmt: skip
     assert find_path(find_cells(nothing, points, np.eye(3)), leaves) is None
+
+
+def test_shares_are_those_of_a_loop_over_views_and_pixels() -> None:
+    rng, size = np.random.default_rng(4), 9.0
+    views = [
+        ThinView(rng.random((SIZE, SIZE)).astype(np.float32), rng.random((SIZE, SIZE)) < 0.3, matrix, 1.0, np.zeros(2))
+        for matrix in CAMERAS.px_from_world.numpy()[:4]
+    ]
+    points = rng.normal(0, 60, (80, 3))
+    cams = [points @ view.px_from_world[:, :3].T + view.px_from_world[:, 3] for view in views]
+    expected = np.full(len(points), np.nan)
+    for index in range(len(points)):
+        shares = []
+        for view, cam in zip(views, cams, strict=True):
+            x, y = np.floor(cam[index, :2] / cam[index, 2]).astype(int)
+            half = round(size * np.linalg.norm(view.px_from_world[0, :3]) / np.median(cam[:, 2]) / 2)
+            if 0 <= x < SIZE and 0 <= y < SIZE and not view.is_hidden[y, x]:
+                around = view.share[max(y - half, 0) : y + half + 1, max(x - half, 0) : x + half + 1]
+                shares.append(around.max())
+        if len(shares) >= 3:
+            expected[index] = np.mean(shares)
+    assert 10 < np.isfinite(expected).sum() < len(points)
+    np.testing.assert_allclose(share_of_views(views, points, size), expected, rtol=1e-6)
 
 
 def test_a_leaf_along_its_stem_has_no_azimuth_but_a_height() -> None:
