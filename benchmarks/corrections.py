@@ -40,7 +40,6 @@ from mvseg.results.result import Result
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
-from mvseg.system.running import running
 
 RATES = (0.0, 0.25, 0.5, 1.0, 2.0)  # answers per leaf
 ROUNDS = 8
@@ -121,13 +120,12 @@ def main() -> None:
     warnings.simplefilter("ignore", InputWarning)
     print("| answers per leaf | " + " | ".join(f"{rate:g}" for rate in RATES) + " | leaves harmed |\n|" + "---|" * 7)
     rows = []
-    with running(keep=True):
-        for folder in args.scenes:
-            case = detect_case(folder, RunConfig(), cache=args.cache / folder.name)
-            rounds, harmed = correct(case)
-            reached = [[each for each in rounds if each[0] <= rate * case.num_leaves][-1] for rate in RATES]
-            rows.append((np.array(reached)[:, 1:], harmed, rounds[-1][0]))
-            print_rows(folder.name, *rows[-1])
+    for folder in args.scenes:
+        case = detect_case(folder, RunConfig(), cache=args.cache / folder.name)
+        rounds, harmed = correct(case)
+        reached = [[each for each in rounds if each[0] <= rate * case.num_leaves][-1] for rate in RATES]
+        rows.append((np.array(reached)[:, 1:], harmed, rounds[-1][0]))
+        print_rows(folder.name, *rows[-1])
     figures, harmed, answers = zip(*rows, strict=True)
     print_rows("mean", np.mean(figures, axis=0), sum(harmed), sum(answers))
 

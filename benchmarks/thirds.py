@@ -71,7 +71,6 @@ from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
-from mvseg.system.running import running
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
 from mvseg.verification.checked_ids import check_ids
@@ -437,8 +436,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
-    with running(keep=True):
-        ROOMS[args.room](args)
+    ROOMS[args.room](args)
 
 
 ROOMS = {

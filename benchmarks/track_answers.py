@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.tracking import Labels, labels_of, measure, read_places
 from mvseg.corrections.track_links import LeafLink
-from mvseg.system.running import running
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.questions import list_questions
 from mvseg.tracking.track import track_leaves
@@ -30,15 +29,14 @@ def answer_questions(dates: Sequence[PlantOnDate], truth: Labels, most: int) -> 
            for leaf, true in zip(date.leaves, labels, strict=True)}  # fmt: skip
     links: list[LeafLink] = []
     measured: list[dict[str, float]] = []
-    with running(keep=True):
-        for _ in range(most + 1):
-            tracks = track_leaves(dates, links=links)
-            measured.append(measure(truth, labels_of(tracks, dates)))
-            questions = list_questions(tracks, links)
-            if not questions:
-                break
-            one, other = (ids[leaf] for leaf in questions[0].link(tracks, is_same=True).leaves)
-            links.append(questions[0].link(tracks, is_same=one == other > 0))
+    for _ in range(most + 1):
+        tracks = track_leaves(dates, links=links)
+        measured.append(measure(truth, labels_of(tracks, dates)))
+        questions = list_questions(tracks, links)
+        if not questions:
+            break
+        one, other = (ids[leaf] for leaf in questions[0].link(tracks, is_same=True).leaves)
+        links.append(questions[0].link(tracks, is_same=one == other > 0))
     return measured
 
 

@@ -45,7 +45,7 @@ def run(args: Namespace) -> int:
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     with open_alone(folder), ExitStack() as stack:
-        now = stack.enter_context(running(num_workers=1 if has_tracks else num_workers, keep=True))
+        now = stack.enter_context(running(num_workers=1 if has_tracks else num_workers))
         opened: OpenResult | OpenTracks = OpenTracks(folder, args.plant) if has_tracks else OpenResult(folder)
         if opened.notice:
             say(f"mvseg: {opened.notice}", to_stderr=True)

@@ -1,13 +1,11 @@
-"""How a run works: whether it shows progress, which processes help it, and what it has computed already.
+"""How a run works: whether it shows progress, which processes help it, and whether it is still wanted.
 
 Stages ask here, so that no signature hands it on (as with `decimal.localcontext`, it is a context variable).
 """
 
 from __future__ import annotations
 
-import hashlib
 import math
-import pickle
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
@@ -15,8 +13,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 from tqdm import tqdm
 
@@ -33,7 +30,6 @@ class Running:
     Attributes:
         progress: show progress bars, and lines that say what was done.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
-        kept: {name of what it was computed from: what was computed}; None: nothing is kept.
         seconds: {stage: wall time}, see `timed`.
         is_cancelled: asked before each stage, see `timed`.
         report: progress callback; None disables it.
@@ -43,16 +39,11 @@ class Running:
 
     progress: bool = False
     workers: ProcessPoolExecutor | None = None
-    kept: dict[str, Any] | None = None
     seconds: dict[str, float] = field(default_factory=dict, compare=False)
     is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
     report: Callable[[str], None] | None = field(default=None, compare=False)
     told: set[str] = field(default_factory=set, compare=False)
     whole: WholeCommand | None = field(default=None, compare=False)
-
-
-Args = ParamSpec("Args")
-Found = TypeVar("Found")
 
 
 class Cancelled(Exception):
@@ -75,7 +66,6 @@ def running(
     *,
     progress: bool | None = None,
     num_workers: int | None = None,
-    keep: bool = False,
     is_cancelled: Callable[[], bool] | None = None,
     report: Callable[[str], None] | None = None,
     plan: Sequence[str] = (),
@@ -85,7 +75,6 @@ def running(
     Args:
         progress: show progress bars; None: as outside.
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
-        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `kept`.
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
         report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
             None: as outside.
@@ -99,7 +88,6 @@ def running(
     with ExitStack() as stack:
         workers = outside.workers if num_workers is None else stack.enter_context(start_workers(num_workers))
         is_shown = outside.progress if progress is None else progress
-        kept = {} if keep and outside.kept is None else outside.kept
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
         told = outside.told if outside.progress else set()
         report = outside.report if report is None else report
@@ -110,7 +98,6 @@ def running(
         now = Running(
             progress=is_shown,
             workers=workers,
-            kept=kept,
             is_cancelled=cancelled,
             report=report,
             told=told,
@@ -138,24 +125,6 @@ def timed(stage: str) -> Iterator[None]:
     with nullcontext() if stage in NETWORKS else on_one_thread():
         yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
-
-
-def kept(compute: Callable[Args, Found]) -> Callable[Args, Found]:
-    """The function; where the run keeps what it computed, see `running`, it is computed once for equal arguments (which
-    must pickle), and nobody may change what it returns."""
-
-    @wraps(compute)
-    def find(*args: Args.args, **options: Args.kwargs) -> Found:
-        known = now_running().kept
-        if known is None:
-            return compute(*args, **options)
-        name = f"{compute.__qualname__} {hashlib.sha256(pickle.dumps((args, options))).hexdigest()}"
-        if name not in known:
-            known[name] = compute(*args, **options)
-        found: Found = known[name]
-        return found
-
-    return find
 
 
 def report_step(sentence: str) -> None:

@@ -17,7 +17,6 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from mvseg.system.running import kept
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import POSES, fitted_costs
@@ -106,7 +105,6 @@ class Poses:
         return guess_chance(pose_gain(self.pair, pose), self.pair.fewer)
 
 
-@kept
 def list_poses(pair: Pair) -> Poses:
     """The poses of two dates, each in its own frame, that look best, and those that leaves suggest which a person says
     are one, each refined; where up is not known, of any rotation. Without leaves on one of them, only that it stood as
@@ -148,7 +146,6 @@ def guess_chance(gain: float, leaves: int) -> float:
     return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
 
 
-@kept
 def pose_gain(pair: Pair, pose: Floats) -> float:
     """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers."""
     costs = fitted_costs(pair.moved(pose))
@@ -237,7 +234,6 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
     return np.concatenate(found)
 
 
-@kept
 def refine(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
     pairs = np.zeros((0, 2), int)

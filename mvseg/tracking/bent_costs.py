@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from mvseg.system.running import kept
 from mvseg.tracking.align import Alignment
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
@@ -19,7 +18,6 @@ from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.numbers import COSTS
 
 
-@kept
 def bent_costs(pair: Pair, alignment: Alignment) -> Floats:
     """(N, M) costs of links, below 0 where leaves are likelier one than not."""
     bent, widths = bend(pair, alignment)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.system.running import kept
 from mvseg.tracking.align import (
     Alignment,
     Habit,
@@ -108,7 +107,6 @@ def compare_dates(
     )  # fmt: skip
 
 
-@kept
 def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
     """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
     there is none."""

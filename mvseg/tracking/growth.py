@@ -15,7 +15,6 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import expit
 
-from mvseg.system.running import kept
 from mvseg.tracking.dates import Floats, Number
 from mvseg.tracking.numbers import GROWTH
 from mvseg.tracking.track import Tracks
@@ -146,7 +145,6 @@ def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
     return float(line[0]), math.sqrt(covariance[0, 0]) if is_known else math.nan
 
 
-@kept
 def fit_curve(track: int, trait: str, seen: tuple[Floats, Floats, Floats]) -> GrowthCurve:
     """The model with the least Akaike criterion through (times, values, sds); robust against single dates."""
     times, values, sds = seen

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.system.running import kept
 from mvseg.tracking.align import alikeness, best_pairs, draw_poses, pose_distances, refine
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
@@ -40,7 +39,6 @@ class Motion:
         return self.margin >= MOTIONS.sure_margin
 
 
-@kept
 def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     """The best second motion of dates that are aligned by a pose (4, 4); None where one is enough."""
     if not pair.fewer:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
-from mvseg.system.running import kept
 from mvseg.tracking.align import (
     Alignment,
     Habit,
@@ -146,7 +145,6 @@ def step_between(poses: Floats, pair: tuple[int, int]) -> Floats:
     return np.round(np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], ALIGN.places)
 
 
-@kept
 def _gain(pair: Pair, pose: Floats) -> float:
     """Of a pose (4, 4) of two dates, less what large new leaves cost."""
     if not pair.fewer:

@@ -91,7 +91,7 @@ def test_a_command_has_one_line_that_never_goes_back(monkeypatch: pytest.MonkeyP
     """A run may repeat stages, and learn, which nobody planned; a stage that does not come is left out."""
     monkeypatch.setattr(sys, "stderr", terminal := Terminal())
     monkeypatch.setattr("mvseg.system.whole_command.REFRESH_SECONDS", 0.0)
-    with running(progress=True, plan=PLAN), running(keep=True):
+    with running(progress=True, plan=PLAN), running():
         for stage in ("detect", "match", "detect", "match", "choose", "learn", "detect", "match", "write"):
             with timed(stage):
                 list(progress_bar(range(3), stage, unit="view"))
