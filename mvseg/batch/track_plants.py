@@ -145,7 +145,7 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
     write_tables(place, tracks, growth)
     if report:
         write_page(place, tracks, growth)
-    warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost.values()))
+    warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.findings, *lost.values()))
     days = tracks.dates[-1].time - tracks.dates[0].time
     return TrackedPlant(dates=len(tracks.dates), tracks=tracks.num_tracks, days=days, warnings=warnings)
 

@@ -45,7 +45,7 @@ class Finding:
 
     @property
     def topic(self) -> str:
-        """The subject: "cameras", "photos", "masks", "poses", "leaves", "edits" or "run"."""
+        """The subject: "cameras", "photos", "masks", "poses", "leaves", "edits", "run" or "dates"."""
         return TOPICS[self.code]
 
     def __str__(self) -> str:

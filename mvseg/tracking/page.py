@@ -109,7 +109,7 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         "leaves": leaves,
         "gaps": [[row.date, row.track, row.state] for row in tracks.rows if row.leaf is None],
         "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in range(1, tracks.num_tracks + 1)},
-        "warnings": list(tracks.warnings),
+        "warnings": list(map(str, tracks.findings)),
     } | _describe_growth(tracks, growth)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.tracking.associate import Association, link_leaves, pairwise_chances, sum_over_poses
 from mvseg.tracking.compare import Comparison, Sight, compare_dates
 from mvseg.tracking.config import Pots
@@ -59,7 +60,7 @@ class Tracks:
         poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the earliest date that it is
             aligned with, by way of others.
         roots: (T,) index of that earliest date.
-        warnings: dates whose alignment is a guess, leaves that moved by themselves, leaves without a shape.
+        findings: dates whose alignment is a guess, leaves that moved by themselves, leaves without a shape.
         chances: see `pairwise_chances`; rows and columns are those of `PlantOnDate.shaped`.
     """
 
@@ -68,7 +69,7 @@ class Tracks:
     rows: tuple[TrackRow, ...]
     poses: Floats
     roots: tuple[int, ...]
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
     chances: Mapping[tuple[int, int], Floats] = field(default_factory=dict)
 
     @property
@@ -100,7 +101,7 @@ def track_leaves(
 
     Returns:
         The tracks. Of each two dates the likeliest alignment is taken, the probability of a link follows from its, and
-        `Tracks.warnings` names those that are guesses. Leaves without a shape get a track of that date alone.
+        `Tracks.findings` names those that are guesses. Leaves without a shape get a track of that date alone.
 
     Raises:
         InputError: fewer than two results, another number of times, times that repeat, units that cannot be converted,
@@ -125,7 +126,7 @@ def track_leaves(
     return Tracks(
         plant=plant, dates=dates, rows=_rank_tracks(_rows(dates, found, compared.roots), dates, compared),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
-        warnings=tuple(_warnings(dates, compared)), chances=pairwise_chances(compared),
+        findings=tuple(_find_doubts(dates, compared)), chances=pairwise_chances(compared),
     )  # fmt: skip
 
 
@@ -237,20 +238,17 @@ def _rank_tracks(
     return tuple(sorted(ranked, key=lambda row: (row.date, row.track)))
 
 
-def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
+def _find_doubts(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[Finding]:
     for later in range(1, len(dates)):
         chance = compared.trust[later - 1, later]
         if chance < ALIGN.told:
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
-            likely = f"{chance:.0%}" if chance >= 0.01 else "less than 1%"
-            yield f"{pair}: how the pot stands is a guess, {likely} likely to be right"
+            yield Finding("pot_guessed", pair, {"likely": f"{chance:.0%}" if chance >= 0.01 else "less than 1%"})
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
-            pair = f"{dates[earlier].scene} and {dates[later].scene}"
-            what = f"{len(motion.pairs)} leaves moved otherwise than the rest, as a second plant or a bent shoot would"
-            yield f"{pair}: {what}; they are linked {'by themselves' if motion.is_sure else 'by other dates only'}"
+            pair, code = f"{dates[earlier].scene} and {dates[later].scene}", "moved_apart"
+            yield Finding(code if motion.is_sure else f"{code}_unsure", pair, {"count": len(motion.pairs)})
     if not all(date.knows_up for date in dates):
-        yield "up is not known on all dates (--up): any turn of the plant was looked at, which is less sure"
-    shapeless = sum(len(date.leaves) - len(date.shaped) for date in dates)
-    if shapeless:
-        yield f"{shapeless} leaves have no shape (seen in one view): each is a track of one date"
+        yield Finding("dates_without_up")
+    if shapeless := sum(len(date.leaves) - len(date.shaped) for date in dates):
+        yield Finding("leaves_without_shape", values={"count": shapeless})

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
+from mvseg.findings.finding import Finding
 from mvseg.tracking.align import Habit, list_poses
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.leaves import Pair, leaves_of
@@ -33,7 +34,7 @@ def test_births_deaths_and_gaps() -> None:
     old = set(range(1, 10))
     dates, truths = days(old, old - {5}, (old | {10}) - {1}, (old | {10}) - {1})
     tracks = track_leaves(dates, plant="basil")
-    assert tracks.warnings == ()
+    assert tracks.findings == ()
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
     assert tracks.num_tracks == 10
     of_leaf = {next(iter(leaves)): track for track, leaves in true_tracks(tracks, truths).items()}
@@ -86,7 +87,7 @@ def test_a_repotted_plant_is_linked_by_guesses_that_say_so() -> None:
     dates, _ = days(set(BLADES), set(BLADES))
     other = see(grow_blades(9, 77), 2, scene="other")[0]
     tracks = track_leaves([*dates, other])
-    assert tracks.warnings[0].startswith("day-1 and other: how the pot stands is a guess, ")
+    assert (tracks.findings[0].code, tracks.findings[0].where) == ("pot_guessed", "day-1 and other")
     guessed = [row.probability for row in tracks.rows if row.date == 2 and not math.isnan(row.probability)]
     sure = [row.probability for row in tracks.rows if row.date == 1]
     assert max(guessed, default=0) < 0.9 < min(sure)
@@ -105,7 +106,7 @@ def two_in_a_pot(turn: float, other: Blades, *, count: int = 2) -> tuple[list[Pl
 def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
     dates, truths = two_in_a_pot(0, grow_blades(8, 31))
     tracks = track_leaves(dates)
-    assert tracks.warnings == ()
+    assert tracks.findings == ()
     assert tracks.num_tracks == 18
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
@@ -114,8 +115,7 @@ def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
 def test_two_plants_that_moved_against_each_other_are_linked_each_by_itself(turn: float, count: int) -> None:
     dates, truths = two_in_a_pot(turn, grow_blades(8, 31), count=count)
     tracks = track_leaves(dates)
-    (sentence,) = tracks.warnings
-    assert sentence.startswith("day-0 and day-1: 8 leaves moved otherwise than the rest")
+    assert tracks.findings == (Finding("moved_apart", "day-0 and day-1", {"count": 8}),)
     assert tracks.num_tracks == 18
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
@@ -136,7 +136,7 @@ def test_a_second_plant_that_could_have_been_turned_in_more_than_one_way_is_not_
     same = half | {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # looks the same from two sides
     dates, truths = two_in_a_pot(60, same)
     tracks = track_leaves(dates)
-    assert "linked by other dates only" in tracks.warnings[0]
+    assert tracks.findings[0].code == "moved_apart_unsure"
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
     assert tracks.num_tracks == 10 + 2 * 8
 
@@ -149,11 +149,11 @@ def test_a_plant_with_one_leaf_and_a_date_without_leaves() -> None:
     assert tracks.rows[1].probability < 1
     fixed = track_leaves(dates, pots="fixed")
     assert fixed.num_tracks == 1
-    assert fixed.warnings == ()
+    assert fixed.findings == ()
     old = set(range(1, 9))
     dates, truths = days(old, set(), old)
     tracks = track_leaves(dates)
-    assert tracks.warnings[0].startswith("day-0 and day-1: how the pot stands is a guess")
+    assert (tracks.findings[0].code, tracks.findings[0].where) == ("pot_guessed", "day-0 and day-1")
     assert tracks.num_tracks == 8  # linked over the date without leaves
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
@@ -162,7 +162,7 @@ def test_a_leaf_without_a_shape_is_a_track_of_one_date() -> None:
     dates, _ = days(set(BLADES), set(BLADES))
     hidden = replace(dates[1].leaves[0], midrib=None, normal=None, points=None)
     tracks = track_leaves([dates[0], replace(dates[1], leaves=(hidden, *dates[1].leaves[1:]))])
-    assert "1 leaves have no shape" in tracks.warnings[0]
+    assert tracks.findings[0] == Finding("leaves_without_shape", values={"count": 1})
     assert tracks.num_tracks == 11
 
 
