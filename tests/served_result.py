@@ -114,7 +114,7 @@ def save(server: CorrectionServer, edits: list[dict[str, Any]]) -> tuple[int, An
 
 
 def save_text(server: CorrectionServer, body: bytes) -> tuple[int, Any]:
-    base = name_edits(server.corrector.corrections.edits)
+    base = name_edits(server.corrector.edits.corrections.edits)
     return ask(server, "PUT", f"edits?base={base}", body)
 
 

@@ -45,10 +45,11 @@ from mvseg.runs.recorded_run import GONE, read_recorded
 from mvseg.runs.request import RunRequest
 from mvseg.scene import Scene, View
 from mvseg.server import open_result
-from mvseg.server.correction_server import CHANGED, Corrector
+from mvseg.server.correction_server import Corrector
 from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, as_sentence, keep_numbers, open_alone
+from mvseg.server.saved_edits import CHANGED
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
@@ -353,7 +354,7 @@ def test_an_edit_that_cannot_be_saved_says_so(
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("mvseg.server.correction_server.write_corrections", refuse)
+    monkeypatch.setattr("mvseg.server.saved_edits.write_corrections", refuse)
     status, answer = save(served, [])
     assert status == 500
     assert answer["problem"] == f"{folder}: the edit could not be saved (Permission denied)"
@@ -371,13 +372,13 @@ def test_the_newest_edits_win(folder: Path) -> None:
             corrector.save(text_of([{"op": "reject", "view": "x", "at": [1, number]} for number in range(3)]), base)
         if is_old():
             raise Cancelled
-        corrector.is_closing = True
+        corrector.close()
         raise InputError("stop")
 
     corrector.opened.recompute = recompute  # type: ignore[method-assign]
     corrector.compute()
     assert seen == [0, 3]
-    assert corrector.problem == "stop"
+    assert corrector.shown.problem == "stop"
     (folder / "corrections.json").unlink()
 
 

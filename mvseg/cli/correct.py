@@ -28,10 +28,11 @@ def run(args: Namespace) -> int:
 
     from mvseg.results.read import find_result
     from mvseg.runs.recorded_run import repeat_command
-    from mvseg.server.correction_server import CORRECTIONS_FILE, Corrector
+    from mvseg.server.correction_server import Corrector
     from mvseg.server.local_server import CorrectionServer
     from mvseg.server.open_result import OpenResult, check_writable, open_alone
     from mvseg.server.open_tracks import OpenTracks
+    from mvseg.server.saved_edits import CORRECTIONS_FILE
     from mvseg.system.running import running
     from mvseg.system.worker_pool import default_workers, load_ahead
     from mvseg.tracking.recorded import is_tracks

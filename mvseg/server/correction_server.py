@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import json
+import itertools
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Generic, Protocol, TypeVar
 
-from mvseg.corrections.file import Corrections, load_corrections, name_edits, parse_corrections, write_corrections
+from mvseg.corrections.file import Corrections
 from mvseg.errors import InputError
+from mvseg.server.saved_edits import Refused, SavedEdits
 from mvseg.system.running import Cancelled, running
 
-CORRECTIONS_FILE = "corrections.json"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
 LOOK_SECONDS = 1.0  # until it looks again whether another program has changed the edits
 STEP_SECONDS = 1.0  # between two words of what is computed
 LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
-CHANGED = "corrections.json was changed by another program since this page was loaded."
 
 
 def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:
@@ -38,16 +36,8 @@ def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int,
     return process.returncode, said
 
 
-class Refused(Exception):
-    """A request that is not answered, with the status and a sentence."""
-
-    def __init__(self, status: HTTPStatus, sentence: str) -> None:
-        super().__init__(sentence)
-        self.status = status
-
-
 class Opened(Protocol):
-    """A folder that a person corrects: a result, or tracks.
+    """A folder that the user corrects: a result, or tracks.
 
     Attributes:
         folder: holds `CORRECTIONS_FILE`.
@@ -64,7 +54,7 @@ class Opened(Protocol):
     def learner(self) -> Learner | None: ...
 
     def read_edits(self) -> tuple[Corrections, str]:
-        """The edits in the folder, and what a person should know of them. Raises InputError: they cannot be read."""
+        """The edits in the folder, and what the user should know of them. Raises InputError: they cannot be read."""
 
     def mark(self, corrections: Corrections) -> Corrections:
         """The edits as they are saved."""
@@ -108,124 +98,116 @@ class Update:
 Kind = TypeVar("Kind", bound=Opened)
 
 
-class Corrector(Generic[Kind]):
-    """What is open, its newest edits, and a thread that computes their consequences; the newest edits win.
+@dataclass(frozen=True)
+class Idle:
+    """All that follows from the edits is computed."""
 
-    The same thread lets the detector learn: what is edited meanwhile is saved, and computed afterwards.
+
+@dataclass(frozen=True)
+class Computing:
+    """The consequences of the newest edits are computed; `doing` says what, "" for what is done at once."""
+
+    number: int
+    doing: str = ""
+
+
+@dataclass(frozen=True)
+class Learning:
+    """The detector learns; `doing` says how far it is, and `then` is what comes back where it learns nothing."""
+
+    doing: str
+    then: Idle | Computing
+    is_cancelled: bool = False
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Nobody waits any more."""
+
+
+Task = Idle | Computing | Learning | Closed
+
+
+@dataclass(frozen=True)
+class Shown:
+    """The newest result on the page.
+
+    Attributes:
+        update: it, see `Update`.
+        problem: a sentence about it; "" for none.
+        number: of the news that brought it.
+    """
+
+    update: Update
+    problem: str = ""
+    number: int = 0
+
+
+class Corrector(Generic[Kind]):
+    """An open folder, its newest edits, and a thread that computes their consequences; the newest edits win.
+
+    The same thread lets the detector learn: what is edited meanwhile is saved, and computed afterwards. `news` is the
+    lock of all attributes, and wakes who waits.
+
+    Attributes:
+        opened: the folder.
+        edits: its edits.
+        task: of the thread.
+        shown: on the page.
+        making: how far the whole result is, which another thread makes; None: it is not made.
+        number: of all news.
     """
 
     def __init__(self, opened: Kind) -> None:
         """Raises InputError: the corrections saved in the folder cannot be read, or are another scene's."""
-        self.opened = opened
-        self.written = self._stamp()
-        self.corrections, self.notice = opened.read_edits()
-        self.news = threading.Condition()
-        self.wanted, self.computed = 1, 0
-        self.number, self.updated = 0, 0  # of all news, and of the newest result among them
-        self.learning, self.is_cancelled = "", False  # what is done of it, "" for nothing
-        self.doing, self.said_at = "", 0.0  # what is computed, "" for nothing, and when that was said last
-        self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
-        self.update: dict[str, Any] | None = None
-        self.is_closing = False
-        self.making_whole, self.making = threading.Lock(), ""  # what is done of it, "" for nothing
-        self.own: set[str] = set()  # `name_edits` of the lists written since the whole result was begun
+        self.opened, self.news, self.number = opened, threading.Condition(), 0
+        self.edits = SavedEdits(opened.folder, opened.read_edits)
+        self.shown = Shown(Update(None, [""] * len(self.edits.corrections.edits), []), self.edits.notice)
+        self._numbers = itertools.count()  # of lists of edits
+        self.task: Task = Computing(next(self._numbers))
+        self.making: str | None = None
 
     def page(self) -> bytes:
         """The page with the newest result, and with all edits that were saved: a reload must not lose any; nor those
         that another program has written to the file since."""
         with self.news:
-            self._take_changes()
-            corrections = self.corrections
+            try:
+                if self.edits.take_changes(self.opened.read_edits):
+                    self._compute_anew()
+            except InputError as error:
+                self.shown = replace(self.shown, problem=f"{error}. The edits on this page are those before.")
+            corrections = self.edits.corrections
         return self.opened.page(corrections).encode()
 
     def save(self, text: bytes, base: str) -> dict[str, Any]:
-        """Write the edits of a corrections.json to the result folder and have them computed; returns their number and
-        `name_edits`. `base`: the `name_edits` of the list that this one was made from.
-
-        Raises:
-            InputError: this is no list of edits.
-            Refused: it was made from another list than the one that is saved: it would undo edits of another page.
-            OSError: the file cannot be written.
-        """
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError):
-            raise InputError("the edits are not whole JSON") from None
-        corrections = parse_corrections(content)
-        name = name_edits(corrections.edits)
+        """Write the edits of a corrections.json to the folder, see `SavedEdits.save`, and have their consequences
+        computed; returns their number and `name_edits`."""
         with self.news:  # one after another, in the order in which they are wanted
-            if name_edits(self.corrections.edits) not in (base, name):  # the same again: its answer was lost
-                raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
-            if self._is_changed():
-                raise Refused(HTTPStatus.CONFLICT, CHANGED)
-            before, self.corrections = self.corrections, self.opened.mark(corrections)
-            try:
-                self._write()
-            except OSError:
-                self.corrections = before
-                raise
-            self.wanted += 1
-            self.news.notify_all()
-        return {"saved": len(self.corrections.edits), "revision": name}
-
-    def _stamp(self) -> tuple[int, int] | None:
-        """What changes when the file of the edits does; None without one."""
-        try:
-            about = (self.opened.folder / CORRECTIONS_FILE).stat()
-        except OSError:
-            return None
-        return about.st_mtime_ns, about.st_size
-
-    def _saved(self) -> Corrections:
-        path = self.opened.folder / CORRECTIONS_FILE
-        return load_corrections(path) if path.is_file() else Corrections()
-
-    def _is_changed(self) -> bool:
-        """Whether another program has written other edits to the file. (One that was deleted is written again.)"""
-        stamp = self._stamp()
-        if stamp in (None, self.written):
-            return False
-        try:
-            found = self._saved()
-        except InputError:
-            return True
-        if name_edits(found.edits) != name_edits(self.corrections.edits):
-            return True
-        self.written = stamp
-        return False
-
-    def _take_changes(self) -> None:
-        """Go on from what another program has written to the file, if it can be read."""
-        if not self._is_changed():
-            return
-        try:
-            stamp = self._stamp()
-            self.corrections, self.notice = self.opened.read_edits()
-        except InputError as error:
-            self.problem = f"{error}. The edits on this page are those before."
-            return
-        self.written = stamp
-        self.wanted += 1
-        self.news.notify_all()
+            self.edits.save(text, base, self.opened.mark)
+            self._compute_anew()
+            return {"saved": len(self.edits.corrections.edits), "revision": self.edits.name}
 
     def compute(self) -> None:
         """Work until `close`; for a thread of its own."""
         while True:
             with self.news:
-                self.news.wait_for(lambda: self.is_closing or self.learning or self.wanted > self.computed)
-                if self.is_closing:
-                    return
-                wanted, corrections, is_learning = self.wanted, self.corrections, bool(self.learning)
-            if is_learning:
+                self.news.wait_for(lambda: not isinstance(self.task, Idle))
+                task, corrections = self.task, self.edits.corrections
+            if isinstance(task, Learning):
                 self._learn_once(corrections)
+            elif isinstance(task, Computing):
+                self._compute_once(task.number, corrections)
             else:
-                self._compute_once(wanted, corrections)
+                return
 
     def _learn_once(self, corrections: Corrections) -> None:
-        problem, wanted = self.problem, 0
+        def is_old() -> bool:
+            return not isinstance(self.task, Learning) or self.task.is_cancelled
+
+        problem, is_learned = self.shown.problem, False
         try:
-            self._learner().learn(corrections, lambda: self.is_closing or self.is_cancelled, self._tell)
-            wanted = 1  # all follows anew
+            self._learner().learn(corrections, is_old, self._tell_learning)
+            is_learned = True
         except Cancelled:
             pass
         except InputError as error:
@@ -233,79 +215,100 @@ class Corrector(Generic[Kind]):
         except Exception as error:  # nor over this
             problem = f"Nothing was learned ({type(error).__name__}: {error})."
         with self.news:
-            self.wanted += wanted
-            self.learning, self.problem = "", problem
+            self.shown = replace(self.shown, problem=problem)
+            if isinstance(self.task, Learning):
+                self.task = Computing(next(self._numbers)) if is_learned else self.task.then
             self._notify()
 
-    def _tell_step(self, said: str) -> None:
-        """What is computed, for the page, from time to time."""
-        if (now := time.monotonic()) - self.said_at >= STEP_SECONDS:
-            with self.news:
-                self.doing, self.said_at = said, now
+    def _tell_learning(self, doing: str) -> None:
+        with self.news:
+            if isinstance(self.task, Learning):
+                self.task = replace(self.task, doing=doing)
                 self._notify()
 
-    def _tell(self, said: str) -> None:
-        with self.news:
-            self.learning = said
-            self._notify()
+    def _compute_once(self, number: int, corrections: Corrections) -> None:
+        told = time.monotonic()  # what is done at once, needs no words
+
+        def is_asked(task: Task) -> bool:
+            return isinstance(task, Computing) and task.number == number
+
+        def is_old() -> bool:
+            return not (is_asked(self.task) or isinstance(self.task, Idle))  # idle once the first update is there
+
+        def tell(doing: str) -> None:
+            nonlocal told
+            if (now := time.monotonic()) - told >= STEP_SECONDS:
+                told = now
+                with self.news:
+                    if is_asked(self.task):
+                        self.task = Computing(number, doing)
+                        self._notify()
+
+        def publish(update: Update, problem: str) -> None:
+            with self.news:
+                self._notify()
+                self.shown = Shown(update, problem, self.number)
+                if is_asked(self.task):
+                    self.task = Idle()
+                elif isinstance(self.task, Learning) and is_asked(self.task.then):
+                    self.task = replace(self.task, then=Idle())
+
+        try:
+            with running(report=tell):
+                for update in self.opened.updates(corrections, is_old):
+                    publish(update, " ".join([self.edits.notice, *update.messages]).strip())
+            return
+        except Cancelled:
+            return
+        except InputError as error:
+            problem = str(error)
+        except Exception as error:  # the user must not lose the page over what one list of edits does
+            problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
+        publish(Update(self.shown.update.news, [""] * len(corrections.edits), []), problem)
+
+    def _compute_anew(self) -> None:
+        """Ask for the consequences of the edits, for whoever holds the lock; if the detector learns, afterwards."""
+        wanted = Computing(next(self._numbers))
+        if isinstance(self.task, Learning):
+            self.task = replace(self.task, then=wanted)
+        elif not isinstance(self.task, Closed):
+            self.task = wanted
+        self.news.notify_all()
 
     def _notify(self) -> None:
         """There is something new to hear of, for whoever holds the lock."""
         self.number += 1
         self.news.notify_all()
 
-    def _compute_once(self, wanted: int, corrections: Corrections) -> None:
-        def is_old() -> bool:
-            return self.is_closing or bool(self.learning) or self.wanted > wanted
-
-        self.said_at = time.monotonic()  # what is done at once, needs no words
-        try:
-            with running(report=self._tell_step):
-                for update in self.opened.updates(corrections, is_old):
-                    self._publish(update, " ".join([self.notice, *update.messages]).strip(), wanted)
-            return
-        except Cancelled:
-            return
-        except InputError as error:
-            problem = str(error)
-        except Exception as error:  # the person must not lose the page over what one list of edits does
-            problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
-        self._publish(Update(self.update, [""] * len(corrections.edits), []), problem, wanted)
-
-    def _publish(self, update: Update, problem: str, wanted: int) -> None:
-        with self.news:
-            self.update, self.outcomes = update.news, update.outcomes
-            self.problem, self.computed, self.doing = problem, wanted, ""
-            self._notify()
-            self.updated = self.number
-
     def state(self, after: int) -> dict[str, Any]:
         """What the page shows, and the name of the edits that are saved (`revision`): at once for an `after` below 0,
         otherwise as soon as there is something newer."""
         with self.news:
             end = time.monotonic() + WAIT_SECONDS
-            while 0 <= after >= self.number and not self.is_closing and time.monotonic() < end:
-                if self._is_changed():
+            while 0 <= after >= self.number and not isinstance(self.task, Closed) and time.monotonic() < end:
+                if self.edits.is_changed():
                     break
                 self.news.wait(LOOK_SECONDS)
+            task, shown = self.task, self.shown
+            computing = task.then if isinstance(task, Learning) else task
             return {
                 "number": self.number,
-                "revision": name_edits(self.corrections.edits),
-                "isComputing": self.wanted > self.computed,
-                "doing": self.doing,
-                "isChanged": self._is_changed(),
-                "problem": self.problem,
-                "outcomes": self.outcomes,
-                "update": self.update if self.updated > after else None,
-                "learning": self._describe_learning(),
-                "making": self.making,
+                "revision": self.edits.name,
+                "isComputing": isinstance(computing, Computing),
+                "doing": task.doing if isinstance(task, Computing) else "",
+                "isChanged": self.edits.is_changed(),
+                "problem": shown.problem,
+                "outcomes": shown.update.outcomes,
+                "update": shown.update.news if shown.number > after else None,
+                "learning": self._describe_learning(task.doing if isinstance(task, Learning) else ""),
+                "making": self.making or "",
             }
 
-    def _describe_learning(self) -> dict[str, Any] | None:
+    def _describe_learning(self, doing: str) -> dict[str, Any] | None:
         if (learner := self.opened.learner) is None:
             return None
         seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * learner.num_views
-        return {"now": self.learning, "isLearned": learner.is_learned, "seconds": seconds}
+        return {"now": doing, "isLearned": learner.is_learned, "seconds": seconds}
 
     def _learner(self) -> Learner:
         if (learner := self.opened.learner) is None:
@@ -313,7 +316,7 @@ class Corrector(Generic[Kind]):
         return learner
 
     def learn(self) -> dict[str, Any]:
-        """Let the detector learn the leaves that the views agree about, and those that a person outlined, see
+        """Let the detector learn the leaves that the views agree about, and those that the user outlined, see
         `OpenResult.learn`; `state` says how far it is.
 
         Raises:
@@ -322,16 +325,18 @@ class Corrector(Generic[Kind]):
         with self.news:
             self._learner()
             self._refuse_while_learning()
-            if self.making_whole.locked():
+            if self.making is not None:
                 raise Refused(HTTPStatus.CONFLICT, "The whole result is being made: wait until it is there.")
-            self.learning, self.is_cancelled = "looking for what to learn from", False
+            if isinstance(self.task, Idle | Computing):
+                self.task = Learning("looking for what to learn from", then=self.task)
             self._notify()
         return {}
 
     def cancel(self) -> dict[str, Any]:
         """Learn no further; all stays as it was."""
         with self.news:
-            self.is_cancelled = True
+            if isinstance(self.task, Learning):
+                self.task = replace(self.task, is_cancelled=True)
         return {}
 
     def unlearn(self) -> dict[str, Any]:
@@ -344,12 +349,12 @@ class Corrector(Generic[Kind]):
             self._refuse_while_learning()
             if (learner := self._learner()).is_learned:
                 learner.unlearn()
-                self.wanted += 1
+                self._compute_anew()
                 self._notify()
         return {}
 
     def _refuse_while_learning(self) -> None:
-        if self.learning:
+        if isinstance(self.task, Learning):
             raise Refused(HTTPStatus.CONFLICT, "The detector is learning: wait until it is done, or cancel it.")
 
     def whole(self) -> dict[str, Any]:
@@ -360,52 +365,35 @@ class Corrector(Generic[Kind]):
             Refused: it is being made already, or the detector learns.
             InputError: the run ended with an error; its sentence.
         """
-        if not self.making_whole.acquire(blocking=False):
-            raise Refused(HTTPStatus.CONFLICT, "The whole result is being made already.")
+        with self.news:
+            if self.making is not None:
+                raise Refused(HTTPStatus.CONFLICT, "The whole result is being made already.")
+            self._refuse_while_learning()
+            self.edits.begin()
+            self.making = ""
         try:
-            folder = self.opened.folder.resolve()
-            path = folder / CORRECTIONS_FILE
-            with self.news:
-                self._refuse_while_learning()
-                if self._is_changed():
-                    raise InputError(CHANGED)
-                self._write()
-                self.own = {name_edits(self.corrections.edits)}
             with TemporaryDirectory() as place:
-                words = [*self.opened.again(Path(place)), "--corrections", str(path)]
+                words = [*self.opened.again(Path(place)), "--corrections", str(self.edits.path.resolve())]
                 returncode, said = run_command(words, self._tell_making)
             with self.news:
-                self._write_newest()
+                self.edits.write_again()
             if returncode:
                 raise InputError(said or "the run was stopped")
             opened = self.opened.reopened()
             with self.news:
-                self.opened, self.update = opened, None
-                self.wanted += 1
+                self.opened, self.shown = opened, replace(self.shown, update=replace(self.shown.update, news=None))
+                self._compute_anew()
         finally:
-            self._tell_making("")
-            self.making_whole.release()
+            self._tell_making(None)
         return {}
 
-    def _tell_making(self, said: str) -> None:
+    def _tell_making(self, said: str | None) -> None:
         with self.news:
             self.making = said
             self._notify()
 
-    def _write(self) -> None:
-        write_corrections(self.opened.folder / CORRECTIONS_FILE, self.corrections)
-        self.written = self._stamp()
-        self.own.add(name_edits(self.corrections.edits))
-
-    def _write_newest(self) -> None:
-        """After the folder was made anew: write the newest edits again where the file holds earlier ones of this page,
-        whoever put them back; but never over those of another program."""
-        with suppress(InputError):  # theirs, and broken: `_is_changed` says so
-            if name_edits(self._saved().edits) in self.own:
-                self._write()
-
     def close(self) -> None:
         """Let everybody who waits go."""
         with self.news:
-            self.is_closing = True
+            self.task = Closed()
             self.news.notify_all()

@@ -19,7 +19,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
-from mvseg.server.correction_server import Corrector, Refused
+from mvseg.server.correction_server import Corrector
+from mvseg.server.saved_edits import Refused
 
 HOST = "127.0.0.1"
 

@@ -1,0 +1,136 @@
+"""The edits of a page, in memory and in their file, which another program may change."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import suppress
+from http import HTTPStatus
+from pathlib import Path
+
+from mvseg.corrections.file import Corrections, load_corrections, name_edits, parse_corrections, write_corrections
+from mvseg.errors import InputError
+
+CORRECTIONS_FILE = "corrections.json"
+CHANGED = "corrections.json was changed by another program since this page was loaded."
+Read = Callable[[], tuple[Corrections, str]]  # the edits in the folder, and what the user should know of them
+
+
+class Refused(Exception):
+    """A request that is not answered, with the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class SavedEdits:
+    """The newest edits of a folder. Not safe for threads: its owner holds a lock.
+
+    Attributes:
+        corrections: the newest ones.
+        notice: what the user should know of them; "" for nothing.
+    """
+
+    def __init__(self, folder: Path, read: Read) -> None:
+        """Raises InputError: the edits in the folder cannot be read, or are another scene's."""
+        self.path = folder / CORRECTIONS_FILE
+        self._stamp = self._find_stamp()
+        self.corrections, self.notice = read()
+        self._own: set[str] = set()  # `name_edits` of the lists written since `begin`
+
+    @property
+    def name(self) -> str:
+        """The `name_edits` of the newest edits."""
+        return name_edits(self.corrections.edits)
+
+    def save(self, text: bytes, base: str, mark: Callable[[Corrections], Corrections]) -> None:
+        """Write the edits of a corrections.json.
+
+        Args:
+            text: its content.
+            base: the `name_edits` of the list that this one was made from.
+            mark: what else is written with the edits.
+
+        Raises:
+            InputError: this is no list of edits.
+            Refused: it was made from another list than the one that is saved: it would undo edits of another page.
+            OSError: the file cannot be written; the edits stay as they were.
+        """
+        try:
+            content = json.loads(text)
+        except (ValueError, RecursionError):
+            raise InputError("the edits are not whole JSON") from None
+        corrections = parse_corrections(content)
+        if self.name not in (base, name_edits(corrections.edits)):  # the same again: its answer was lost
+            raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
+        if self.is_changed():
+            raise Refused(HTTPStatus.CONFLICT, CHANGED)
+        before, self.corrections = self.corrections, mark(corrections)
+        try:
+            self.write()
+        except OSError:
+            self.corrections = before
+            raise
+
+    def is_changed(self) -> bool:
+        """Whether another program has written other edits to the file. (One that was deleted is written again.)"""
+        stamp = self._find_stamp()
+        if stamp in (None, self._stamp):
+            return False
+        try:
+            found = self._read_file()
+        except InputError:
+            return True
+        if name_edits(found.edits) != self.name:
+            return True
+        self._stamp = stamp
+        return False
+
+    def take_changes(self, read: Read) -> bool:
+        """Go on from what another program has written to the file; False where it has written nothing.
+
+        Raises:
+            InputError: it cannot be read; the edits stay as they were.
+        """
+        if not self.is_changed():
+            return False
+        stamp = self._find_stamp()
+        self.corrections, self.notice = read()
+        self._stamp = stamp
+        return True
+
+    def write(self) -> None:
+        """Write the newest edits."""
+        write_corrections(self.path, self.corrections)
+        self._stamp = self._find_stamp()
+        self._own.add(self.name)
+
+    def begin(self) -> None:
+        """Write the newest edits before the folder is made anew.
+
+        Raises:
+            InputError: another program has changed the file.
+        """
+        if self.is_changed():
+            raise InputError(CHANGED)
+        self._own.clear()
+        self.write()
+
+    def write_again(self) -> None:
+        """After the folder was made anew: write the newest edits where the file holds earlier ones of this page,
+        whoever put them back; but never over those of another program."""
+        with suppress(InputError):  # theirs, and broken: `is_changed` says so
+            if name_edits(self._read_file().edits) in self._own:
+                self.write()
+
+    def _find_stamp(self) -> tuple[int, int] | None:
+        """What changes when the file does; None without one."""
+        try:
+            about = self.path.stat()
+        except OSError:
+            return None
+        return about.st_mtime_ns, about.st_size
+
+    def _read_file(self) -> Corrections:
+        return load_corrections(self.path) if self.path.is_file() else Corrections()
