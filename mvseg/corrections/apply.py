@@ -6,7 +6,7 @@ whole instances (`everywhere`) waits until they are known: see `mvseg.correction
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from mvseg.corrections.corrected import APPLIED, CONTRADICTED, NOTHING, PASSED, Corrected, Fate, Refused, Whole
-from mvseg.corrections.edited_mask import EditedMask, as_table, hang_together, side_of
+from mvseg.corrections.edited_mask import EditedMask, Key, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
@@ -32,38 +32,72 @@ from mvseg.scene import Scene
 
 
 class _Tie(NamedTuple):
-    """What an edit says of two masks: that they must, or cannot, show one leaf."""
+    """What an edit says of two masks, by their keys: that they must, or cannot, show one leaf."""
 
     edit: int
     must: bool
-    one: EditedMask
-    other: EditedMask
+    one: Key
+    other: Key
 
 
 class _About(NamedTuple):
     """An edit about the whole instance of a mask."""
 
     edit: int
-    mask: EditedMask
+    mask: Key
     rejects: bool
 
 
-@dataclass(eq=False)
-class _Work:
-    """All that edits change."""
+@dataclass(frozen=True)
+class _Edited:
+    """A scene's masks as the edits so far leave them.
 
-    scene: Scene
-    masks: list[EditedMask]
-    fates: dict[int, Fate] = field(default_factory=dict)
-    ties: list[_Tie] = field(default_factory=list)
-    everywhere: list[_About] = field(default_factory=list)
-    words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
-    rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
-    refused: list[Refused] = field(default_factory=list)
+    Attributes:
+        masks: in the order in which they are drawn.
+        fates: {number of the edit: its fate}.
+        ties: between masks, some of which may be gone.
+        everywhere: what edits say of whole instances.
+        words: (word for a leaf, edit, mask outlined with it).
+        rejected: masks rejected in one photo, and by which edit.
+        refused: pixels where the user says that no leaf is, and where no mask is.
+    """
+
+    masks: tuple[EditedMask, ...]
+    fates: Mapping[int, Fate] = field(default_factory=dict)
+    ties: tuple[_Tie, ...] = ()
+    everywhere: tuple[_About, ...] = ()
+    words: tuple[tuple[str, int, Key], ...] = ()
+    rejected: tuple[tuple[int, EditedMask], ...] = ()
+    refused: tuple[Refused, ...] = ()
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
-        return any(each.rejects and each.mask is mask for each in self.everywhere)
+        return any(each.rejects and each.mask == mask.key for each in self.everywhere)
+
+    def with_fate(self, fate: Fate) -> _Edited:
+        return replace(self, fates={**self.fates, fate.edit: fate})
+
+    def with_edit(self, number: int, keys: Collection[Key], *, origin: int | None = None) -> _Edited:
+        """Masks that an edit names; they have a new origin, if there is one."""
+        masks = (
+            replace(mask, edits=(*mask.edits, number), origin=mask.origin if origin is None else origin)
+            if mask.key in keys
+            else mask
+            for mask in self.masks
+        )
+        return replace(self, masks=tuple(masks))
+
+    def contradict(self, number: int, edits: Collection[int]) -> _Edited:
+        """An edit contradicts earlier ones."""
+        fate = CONTRADICTED.format(number)
+        return replace(self, fates={**self.fates, **{n: replace(self.fates[n], fate=fate) for n in edits}})
+
+    def without(self, number: int, mask: EditedMask) -> _Edited:
+        """An edit takes a mask away; those that made it, or linked it, are contradicted."""
+        linked = [each.edit for each in self.ties if mask.key in (each.one, each.other)]
+        about = [each.edit for each in self.everywhere if each.mask == mask.key]
+        left = replace(self, masks=tuple(each for each in self.masks if each.key != mask.key))
+        return left.contradict(number, [*mask.edits, *linked, *about])
 
 
 class _Lost(Exception):
@@ -71,7 +105,7 @@ class _Lost(Exception):
 
 
 def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
-    """Apply edits to the masks of a scene, one after the other.
+    """Apply edits to the masks of a scene, one after the other. An edit that points at nothing changes nothing.
 
     Args:
         corrections: the edits; those that link dates are passed over.
@@ -79,45 +113,40 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         scene: their scene. Points and polygons of the edits are in its photos' own pixels, with distortion.
 
     Returns:
-        The masks, without those that were rejected or that an outline replaced, and the links. Masks that a person
+        The masks, without those that were rejected or that an outline replaced, and the links. Masks that the user
         drew, cut or confirmed have an `origin` from `Origin.CORRECTED` on.
     """
     masks = masks.to("cpu")
-    regions, origins = masks.regions, masks.origin.tolist()
-    views = regions.view_index.tolist()
-    rows = range(len(masks))
-    work = _Work(scene, [EditedMask(views[n], regions.placed(n), n, origins[n]) for n in rows])
+    rows = zip(masks.view_index.tolist(), masks.origin.tolist(), strict=True)
+    edited = _Edited(tuple(EditedMask((0, n), view, masks.regions.placed(n), n, origin)
+                           for n, (view, origin) in enumerate(rows)))  # fmt: skip
     for number, edit in enumerate(corrections.edits, start=1):
+        passed = edited.with_fate(Fate(number, edit.op, PASSED if isinstance(edit, TrackLink) else APPLIED))
         try:
-            work.fates[number] = Fate(number, edit.op, PASSED if isinstance(edit, TrackLink) else APPLIED)
-            _apply_one(work, number, edit)
+            edited = _apply_one(passed, number, edit, scene)
         except _Lost as error:
-            work.fates[number] = Fate(number, edit.op, NOTHING, str(error))
-    for outlines in work.words.values():
-        alive = [(number, mask) for number, mask in outlines if mask in work.masks]
-        work.ties += [_Tie(number, True, alive[0][1], mask) for number, mask in alive[1:]]
-    _clear_outlines(work.masks)
-    order = sorted(work.masks, key=lambda mask: mask.view)
-    place = {mask: n for n, mask in enumerate(order)}
-    links = _agreeing_links(work, place)
+            edited = edited.with_fate(Fate(number, edit.op, NOTHING, str(error)))
+    order = sorted(_clear_outlines(edited.masks), key=lambda mask: mask.view)
+    place = {mask.key: n for n, mask in enumerate(order)}
+    edited = replace(edited, ties=(*edited.ties, *_ties_of_words(edited.words, place)))
+    edited, links = _agreeing_links(edited, place)
     is_linked, links = links.named(len(order)), _keep_outlines_apart(links, order)
     table = replace(as_table(masks, order), is_linked=is_linked)
     if len(links.must):
         component = links.components(len(order))
-        _tell_of_parts(work, place, component)
+        edited = _tell_of_parts(edited, order, component, scene)
         first = np.unique(component, return_index=True)[1]
         table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
-    everywhere = tuple(
-        Whole(each.edit, place[each.mask], each.rejects) for each in work.everywhere if each.mask in place
-    )
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
     return Corrected(
         masks=table,
         links=links,
         last_edits=last_edits,
-        everywhere=everywhere,
-        refused=tuple(work.refused),
-        fates=tuple(work.fates.values()),
+        everywhere=tuple(
+            Whole(each.edit, place[each.mask], each.rejects) for each in edited.everywhere if each.mask in place
+        ),
+        refused=edited.refused,
+        fates=tuple(edited.fates.values()),
     )
 
 
@@ -126,121 +155,143 @@ def is_on(edit: Edit, regions: Regions, rows: Sequence[int], *, scene: Scene) ->
     places = edit.at if isinstance(edit, Link) else ()
     if isinstance(edit, (Reject, Confirm, Split)):
         places = ((edit.view, *edit.at),)
-    work = _Work(scene, [])
     for place in places:
         with suppress(_Lost):
-            if set(rows) & set(regions.at(*_pixel_at(work, place))):
+            if set(rows) & set(regions.at(*_pixel_at(scene, place))):
                 return True
     return False
 
 
-def _apply_one(work: _Work, number: int, edit: Edit) -> None:
+def _apply_one(edited: _Edited, number: int, edit: Edit, scene: Scene) -> _Edited:
     if isinstance(edit, Outline):
-        _outline(work, number, edit)
-    elif isinstance(edit, Reject):
-        place = edit.view, *edit.at
-        pixel = _pixel_at(work, place)
-        if not _masks_at(work, place, work.masks):
-            work.refused.append(Refused(number, *pixel, edit.everywhere))
-        mask = _mask_at(work, place)
-        if edit.everywhere:
-            _contradict(work, number, mask.edits)
-            work.everywhere.append(_About(number, mask, True))
-        else:
-            _remove(work, number, mask)
-            work.rejected.append((number, mask))
-    elif isinstance(edit, Confirm):
-        mask = _kept_mask_at(work, number, (edit.view, *edit.at))
-        mask.origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
-        mask.edits.append(number)
-        if edit.everywhere:
-            work.everywhere.append(_About(number, mask, False))
-    elif isinstance(edit, Split):
-        _split(work, number, edit)
-    elif isinstance(edit, Link):
-        _link(work, number, edit)
+        return _outline(edited, number, edit, scene)
+    if isinstance(edit, Reject):
+        return _reject(edited, number, edit, scene)
+    if isinstance(edit, Confirm):
+        edited, mask = _kept_mask_at(edited, number, (edit.view, *edit.at), scene)
+        origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
+        edited = edited.with_edit(number, {mask.key}, origin=origin)
+        about = (_About(number, mask.key, False),) if edit.everywhere else ()
+        return replace(edited, everywhere=(*edited.everywhere, *about))
+    if isinstance(edit, Split):
+        return _split(edited, number, edit, scene)
+    return _link(edited, number, edit, scene) if isinstance(edit, Link) else edited
 
 
-def _outline(work: _Work, number: int, edit: Outline) -> None:
-    view = _view(work.scene, edit.view)
-    width, height = work.scene.cameras.sizes[view].tolist()
+def _outline(edited: _Edited, number: int, edit: Outline, scene: Scene) -> _Edited:
+    view = _view(scene, edit.view)
+    width, height = scene.cameras.sizes[view].tolist()
     polygon = [coordinate for point in edit.polygon for coordinate in point]
     try:
         drawn = decode_segmentation([polygon], width, height).astype(np.uint8)
     except InputError as error:
         raise _Lost(f"its polygon cannot be drawn ({error})") from None
-    frame = undistort(drawn, work.scene.views[view].lens, work.scene.cameras.K[view].cpu().numpy()) > 0
+    frame = undistort(drawn, scene.views[view].lens, scene.cameras.K[view].cpu().numpy()) > 0
     if not frame.any():
         raise _Lost(f"its polygon covers no pixel of view {edit.view}")
     crop = Crop.of(frame)
-    covered = []
-    for mask in [each for each in work.masks if each.view == view and not work.is_rejected(each)]:
-        if mask.crop.intersect(crop).area > EDITS.covered * mask.crop.area:
-            covered.append(mask)
+    there = [each for each in edited.masks if each.view == view and not edited.is_rejected(each)]
+    covered = [mask for mask in there if mask.crop.intersect(crop).area > EDITS.covered * mask.crop.area]
     row = max(covered, key=lambda mask: mask.crop.area).row if covered else -1
     for mask in covered:
-        _remove(work, number, mask)
+        edited = edited.without(number, mask)
     if len(covered) > EDITS.most_covered:
-        work.fates[number] = Fate(number, edit.op, APPLIED, f"it replaces {len(covered)} masks")
-    made = EditedMask(view, crop, row, int(Origin.CORRECTED), [number])
-    work.masks.append(made)
-    if edit.leaf is not None:
-        work.words.setdefault(edit.leaf, []).append((number, made))
+        edited = edited.with_fate(Fate(number, edit.op, APPLIED, f"it replaces {len(covered)} masks"))
+    made = EditedMask((number, 0), view, crop, row, int(Origin.CORRECTED), (number,))
+    words = () if edit.leaf is None else ((edit.leaf, number, made.key),)
+    return replace(edited, masks=(*edited.masks, made), words=(*edited.words, *words))
 
 
-def _clear_outlines(masks: Sequence[EditedMask]) -> None:
-    """A pixel shows one leaf: what lies in an outline is taken from every mask drawn before it."""
-    for n, drawn in enumerate(masks):
-        for mask in masks[:n] if drawn.origin == Origin.CORRECTED else []:
-            both = mask.crop.intersect(drawn.crop) if mask.view == drawn.view else None
-            if both is not None and 0 < both.area < mask.crop.area:
-                mask.crop = Crop(mask.crop.box, mask.crop.pixels & ~both.pixels).tighten()
+def _reject(edited: _Edited, number: int, edit: Reject, scene: Scene) -> _Edited:
+    place = edit.view, *edit.at
+    try:
+        mask = _mask_at(edited, place, scene)
+    except _Lost as error:
+        nothing = Refused(number, *_pixel_at(scene, place), edit.everywhere)
+        lost = edited.with_fate(Fate(number, edit.op, NOTHING, str(error)))
+        return replace(lost, refused=(*lost.refused, nothing))
+    if edit.everywhere:
+        edited = edited.contradict(number, mask.edits)
+        return replace(edited, everywhere=(*edited.everywhere, _About(number, mask.key, True)))
+    return replace(edited.without(number, mask), rejected=(*edited.rejected, (number, mask)))
 
 
-def _split(work: _Work, number: int, edit: Split) -> None:
-    mask = _kept_mask_at(work, number, (edit.view, *edit.at))
-    line = _to_pinhole(work.scene, mask.view, edit.line)
+def _split(edited: _Edited, number: int, edit: Split, scene: Scene) -> _Edited:
+    edited, mask = _kept_mask_at(edited, number, (edit.view, *edit.at), scene)
+    line = _to_pinhole(scene, mask.view, edit.line)
     if np.ptp(line, axis=0).max() < 1:
         raise _Lost("its line is a point")
     pixels, is_left = mask.crop.pixels, side_of(line, mask.crop)
     halves = [replace(mask.crop, pixels=pixels & side) for side in (is_left, ~is_left)]
     if not all(half.area for half in halves):
         raise _Lost("its line does not cut the mask")
-    parts = [EditedMask(mask.view, half.tighten(), mask.row, int(Origin.CUT), [number]) for half in halves]
-    _remove(work, number, mask)
-    work.masks += parts
-    work.ties.append(_Tie(number, False, parts[0], parts[1]))
+    one, other = (
+        EditedMask((number, n), mask.view, half.tighten(), mask.row, int(Origin.CUT), (number,))
+        for n, half in enumerate(halves)
+    )
+    edited = edited.without(number, mask)
+    tie = _Tie(number, False, one.key, other.key)
+    return replace(edited, masks=(*edited.masks, one, other), ties=(*edited.ties, tie))
 
 
-def _link(work: _Work, number: int, edit: Link) -> None:
-    found = [_kept_mask_at(work, number, place) for place in edit.at]
-    masks = list(dict.fromkeys(found))
-    for mask in masks:
-        mask.edits.append(number)
+def _link(edited: _Edited, number: int, edit: Link, scene: Scene) -> _Edited:
+    found = []
+    for place in edit.at:
+        edited, mask = _kept_mask_at(edited, number, place, scene)
+        found.append(mask.key)
+    keys = list(dict.fromkeys(found))
     if edit.op == "same":
-        work.ties += [_Tie(number, True, masks[0], mask) for mask in masks[1:]]
-    elif len(masks) < len(found):
+        ties = [_Tie(number, True, keys[0], key) for key in keys[1:]]
+    elif len(keys) < len(found):
         raise _Lost("two of its places show the same mask: split it")
     else:
-        work.ties += [_Tie(number, False, one, other) for n, one in enumerate(masks) for other in masks[:n]]
+        ties = [_Tie(number, False, one, other) for n, one in enumerate(keys) for other in keys[:n]]
+    return replace(edited.with_edit(number, keys), ties=(*edited.ties, *ties))
 
 
-def _tell_of_parts(work: _Work, place: dict[EditedMask, int], component: NDArray[np.int64]) -> None:
+def _clear_outlines(masks: Sequence[EditedMask]) -> list[EditedMask]:
+    """A pixel shows one leaf: what lies in an outline is taken from every mask drawn before it."""
+    cleared = list(masks)
+    for n, drawn in enumerate(masks):
+        for earlier in range(n) if drawn.origin == Origin.CORRECTED else ():
+            crop = cleared[earlier].crop
+            both = crop.intersect(drawn.crop) if drawn.view == masks[earlier].view else None
+            if both is not None and 0 < both.area < crop.area:
+                crop = Crop(crop.box, crop.pixels & ~both.pixels).tighten()
+                cleared[earlier] = replace(cleared[earlier], crop=crop)
+    return cleared
+
+
+def _ties_of_words(words: Sequence[tuple[str, int, Key]], place: Mapping[Key, int]) -> list[_Tie]:
+    """Outlines that stay, of one word for a leaf, show one leaf."""
+    first: dict[str, Key] = {}
+    ties = []
+    for word, edit, key in words:
+        if key in place and first.setdefault(word, key) != key:
+            ties.append(_Tie(edit, True, first[word], key))
+    return ties
+
+
+def _tell_of_parts(
+    edited: _Edited, masks: Sequence[EditedMask], component: NDArray[np.int64], scene: Scene
+) -> _Edited:
     """Masks of one photo that edits say are one leaf, but do not touch: the last of these edits says so."""
+    group_of = {mask.key: int(group) for mask, group in zip(masks, component, strict=True)}
     groups: dict[tuple[int, int], list[EditedMask]] = {}
-    for mask, row in place.items():
-        groups.setdefault((int(component[row]), mask.view), []).append(mask)
-    for (group, view), masks in groups.items():
-        edits = [tie.edit for tie in work.ties if tie.must and tie.one in place and component[place[tie.one]] == group]
-        if edits and not hang_together(masks):
-            message = f"a contradiction: its masks in view {work.scene.views[view].name} do not touch"
-            work.fates[max(edits)] = replace(work.fates[max(edits)], problem=message)
+    for mask in masks:
+        groups.setdefault((group_of[mask.key], mask.view), []).append(mask)
+    for (group, view), parts in groups.items():
+        edits = [tie.edit for tie in edited.ties if tie.must and group_of.get(tie.one) == group]
+        if edits and not hang_together(parts):
+            message = f"a contradiction: its masks in view {scene.views[view].name} do not touch"
+            edited = edited.with_fate(replace(edited.fates[max(edits)], problem=message))
+    return edited
 
 
-def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
+def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited, Links]:
     """The links that hold, of rows: the latest first, and none that contradicts those. The edit of one that does not
     hold is contradicted by the latest edit without which it would; or by itself."""
-    ties = [each for each in work.ties if each.one in place and each.other in place]
+    ties = [each for each in edited.ties if each.one in place and each.other in place]
 
     def links_of(edits: Collection[int]) -> Links | None:
         said = [each for each in ties if each.edit in edits]
@@ -255,7 +306,7 @@ def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
 
     edits = sorted({each.edit for each in ties}, reverse=True)
     if (links := links_of(edits)) is not None:
-        return links
+        return edited, links
     held: list[int] = []
     links = Links.of()
     for number in edits:
@@ -263,11 +314,11 @@ def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
         if agreeing is not None:
             links, held = agreeing, [*held, number]
         elif links_of([number]) is None:
-            _contradict(work, number, [number])
+            edited = edited.contradict(number, [number])
         else:
             culprits = (later for later in held if links_of({number, *held} - {later}) is not None)
-            _contradict(work, next(culprits, max(held)), [number])
-    return links
+            edited = edited.contradict(next(culprits, max(held)), [number])
+    return edited, links
 
 
 def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
@@ -279,53 +330,41 @@ def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
     return replace(links, cannot=torch.cat((links.cannot, torch.from_numpy(pairs))))
 
 
-def _remove(work: _Work, number: int, mask: EditedMask) -> None:
-    """Take a mask away; the edits that made it, or linked it, are contradicted."""
-    work.masks.remove(mask)
-    linked = [each.edit for each in work.ties if mask in (each.one, each.other)]
-    about = [each.edit for each in work.everywhere if each.mask is mask]
-    _contradict(work, number, [*mask.edits, *linked, *about])
-
-
-def _contradict(work: _Work, number: int, edits: Sequence[int]) -> None:
-    for earlier in edits:
-        work.fates[earlier] = replace(work.fates[earlier], fate=CONTRADICTED.format(number))
-
-
-def _mask_at(work: _Work, place: Place) -> EditedMask:
-    """The mask at a place: what a person outlined there, or else the smallest one, as it would be drawn on top."""
-    here = _masks_at(work, place, work.masks)
+def _mask_at(edited: _Edited, place: Place, scene: Scene) -> EditedMask:
+    """The mask at a place: what the user outlined there, or else the smallest one, as it would be drawn on top."""
+    here = _masks_at(place, edited.masks, scene)
     if not here:
         name, x, y = place
         raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
-    return min(here, key=lambda mask: (work.is_rejected(mask), mask.origin != Origin.CORRECTED, mask.crop.area))
+    return min(here, key=lambda mask: (edited.is_rejected(mask), mask.origin != Origin.CORRECTED, mask.crop.area))
 
 
-def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
+def _kept_mask_at(edited: _Edited, number: int, place: Place, scene: Scene) -> tuple[_Edited, EditedMask]:
     """The same for an edit that says something of a leaf: a mask that was rejected there comes back, if there is no
     other, and its rejection is contradicted. The later edit wins."""
-    gone = _masks_at(work, place, [mask for _, mask in work.rejected])
-    if gone and not _masks_at(work, place, work.masks):
-        work.masks.append(gone[-1])
-    mask = _mask_at(work, place)
-    _contradict(work, number, [n for n, other in work.rejected if other is mask])
-    _contradict(work, number, [each.edit for each in work.everywhere if each.rejects and each.mask is mask])
-    work.rejected = [each for each in work.rejected if each[1] is not mask]
-    work.everywhere = [each for each in work.everywhere if each.mask is not mask or not each.rejects]
-    return mask
+    gone = _masks_at(place, [mask for _, mask in edited.rejected], scene)
+    if gone and not _masks_at(place, edited.masks, scene):
+        edited = replace(edited, masks=(*edited.masks, gone[-1]))
+    mask = _mask_at(edited, place, scene)
+    overridden = [n for n, other in edited.rejected if other.key == mask.key]
+    overridden += [each.edit for each in edited.everywhere if each.rejects and each.mask == mask.key]
+    edited = edited.contradict(number, overridden)
+    rejected = tuple(each for each in edited.rejected if each[1].key != mask.key)
+    everywhere = tuple(each for each in edited.everywhere if each.mask != mask.key or not each.rejects)
+    return replace(edited, rejected=rejected, everywhere=everywhere), mask
 
 
-def _masks_at(work: _Work, place: Place, masks: Sequence[EditedMask]) -> list[EditedMask]:
+def _masks_at(place: Place, masks: Sequence[EditedMask], scene: Scene) -> list[EditedMask]:
     """Those of these masks that a place lies in."""
-    view, column, row = _pixel_at(work, place)
+    view, column, row = _pixel_at(scene, place)
     return [mask for mask in masks if mask.view == view and mask.crop.holds(column, row)]
 
 
-def _pixel_at(work: _Work, place: Place) -> tuple[int, int, int]:
+def _pixel_at(scene: Scene, place: Place) -> tuple[int, int, int]:
     """View, column and row of a place in the undistorted photo."""
     name, x, y = place
-    view = _view(work.scene, name)
-    column, row = np.floor(_to_pinhole(work.scene, view, [(x, y)])[0]).astype(int).tolist()
+    view = _view(scene, name)
+    column, row = np.floor(_to_pinhole(scene, view, [(x, y)])[0]).astype(int).tolist()
     return view, column, row
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,16 +17,20 @@ from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
 from mvseg.regions import stack_regions
 
+Key = tuple[int, int]  # of a mask: the edit that made it, or 0, and which of its masks it is
 
-@dataclass(eq=False)
+
+@dataclass(frozen=True, eq=False)
 class EditedMask:
-    """One mask while edits are applied: the row of the table it began as (-1: none) and the edits that made it."""
+    """One mask while edits are applied: its key, the row of the table it began as (-1: none) and the edits that made
+    it."""
 
+    key: Key
     view: int
     crop: Crop
     row: int
     origin: int
-    edits: list[int] = field(default_factory=list)
+    edits: tuple[int, ...] = ()
 
 
 def side_of(line: NDArray[np.float64], crop: Crop) -> Tensor:
