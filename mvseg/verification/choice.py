@@ -109,6 +109,31 @@ class Said:
         return found
 
 
+@dataclass(frozen=True, eq=False)
+class _Ranked:
+    """One round of the choice.
+
+    Attributes:
+        q: (D, K) how likely each mask shows each candidate.
+        steps: of all candidates, the likeliest first.
+        leaves: (L,) indices of the candidates that are leaves, the likeliest first.
+        stays: (L,) bool, a leaf because the user says so, whatever its chance.
+        certain: (D, L) bool, a mask that shows a leaf because the user says so.
+    """
+
+    q: Floats
+    steps: tuple[Step, ...]
+    leaves: Ints
+    stays: Bools
+    certain: Bools
+
+    @property
+    def chances(self) -> Floats:
+        """(L,) P of the leaves; 1 of those that stay."""
+        chance = {each.candidate: each.chance for each in self.steps}
+        return np.where(self.stays, 1.0, [chance[leaf] for leaf in self.leaves.tolist()])
+
+
 def choose(
     candidates: Candidates,
     table: Masks,
@@ -119,43 +144,54 @@ def choose(
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
 ) -> Chosen:
-    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only)."""
+    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
+    hide those behind them in the next."""
     scores = table.detection_scores.double().numpy()
-    hides, taken, q = np.zeros(len(candidates), bool), [], np.zeros((len(table), len(candidates)))
-    steps: list[Step] = []
     said = said or Said.nothing(len(table))
-    stays, as_seen = candidates.is_certain, np.full(len(table), -1)
+    excluded = ~same_class(candidates, table)
+    if usable is not None:
+        excluded |= ~usable[:, None]
+    excluded |= said.is_of_others[:, None] & candidates.is_certain
+    hides, ranked = np.zeros(len(candidates), bool), None
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
         q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
-        q[~same_class(candidates, table)] = 0
-        if usable is not None:
-            q[~usable] = 0
-        q[np.ix_(said.is_of_others, candidates.is_certain)] = 0
+        q[excluded] = 0
         steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
-        least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
-        is_taken = candidates.is_certain.copy()
-        for each in steps:
-            is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
-        as_seen = said.candidates_as_seen(q, is_taken)
-        stays = candidates.is_certain | np.isin(np.arange(len(candidates)), as_seen)
-        taken = [each for each in steps if is_taken[each.candidate] or stays[each.candidate]]
-        hides = np.zeros(len(candidates), bool)
-        hides[[each.candidate for each in taken]] = True
-        hides &= candidates.is_credible
+        ranked = _accept(candidates, q, steps, said, min_probability)
+        hides = candidates.is_credible & np.isin(np.arange(len(candidates)), ranked.leaves)
         if not hides.any():
             break
-    chosen = np.array([each.candidate for each in taken], np.int64)
-    leaf, shown = assign_masks(q[:, chosen], drawn)
-    certain = candidates.certain[:, chosen] | (as_seen[:, None] == chosen)
-    leaf = np.where(certain.any(1), certain.argmax(1), leaf) if len(chosen) else leaf
-    shown = np.where(certain.any(1), 1.0, shown)
-    counts = np.bincount(leaf[leaf >= 0], minlength=len(chosen))
-    kept = (counts >= CHOICE.least_views) | stays[chosen]
-    place = np.where(kept, kept.cumsum() - 1, -1)
-    leaf = np.where(leaf >= 0, place[leaf], -1) if len(chosen) else leaf
-    chances = np.array([1.0 if stays[each.candidate] else each.chance for each in taken])
-    return Chosen(chosen[kept], chances[kept] if len(chosen) else chances, leaf, shown * (leaf >= 0), tuple(steps))
+    assert ranked is not None, "expected one round or more"
+    return _give_masks(ranked, drawn)
+
+
+def _accept(
+    candidates: Candidates, q: Floats, steps: Sequence[Step], said: Said, min_probability: float | None
+) -> _Ranked:
+    """Which candidates are leaves: those that are likely enough, and have masks enough, and what the user says."""
+    least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
+    is_taken = candidates.is_certain.copy()
+    for each in steps:
+        is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
+    as_seen = said.candidates_as_seen(q, is_taken)
+    stays = candidates.is_certain | np.isin(np.arange(len(candidates)), as_seen)
+    leaves = np.array([each.candidate for each in steps if (is_taken | stays)[each.candidate]], np.int64)
+    certain = candidates.certain[:, leaves] | (as_seen[:, None] == leaves)
+    return _Ranked(q, tuple(steps), leaves, stays[leaves], certain)
+
+
+def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Chosen:
+    """The leaves with their masks; one with too few of them is none, unless the user says so."""
+    leaf, shown = assign_masks(ranked.q[:, ranked.leaves], drawn)
+    if len(ranked.leaves):
+        is_certain = ranked.certain.any(1)
+        leaf, shown = np.where(is_certain, ranked.certain.argmax(1), leaf), np.where(is_certain, 1.0, shown)
+    counts = np.bincount(leaf[leaf >= 0], minlength=len(ranked.leaves))
+    is_left = (counts >= CHOICE.least_views) | ranked.stays
+    place = np.append(np.where(is_left, is_left.cumsum() - 1, -1), -1)  # of no leaf, too
+    leaf = place[leaf]
+    return Chosen(ranked.leaves[is_left], ranked.chances[is_left], leaf, shown * (leaf >= 0), ranked.steps)
 
 
 def same_class(candidates: Candidates, table: Masks) -> Bools:
