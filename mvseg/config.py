@@ -12,7 +12,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.traits.config import TraitsConfig, Up
 
-ENOUGH_VIEWS = 20  # more add time, and next to nothing else (docs/notes/detector.md)
+ENOUGH_VIEWS = 20  # limit: more add time, and next to nothing else (docs/notes/detector.md)
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from torch import Tensor
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 
-BAND = 256  # rows of a label map that are looked at together
-IGNORE_LABEL = 65535  # in label maps: pixels that belong to no region and are left out of every score
+BAND = 256  # limit: rows of a label map that are looked at together
+IGNORE_LABEL = 65535  # definition: in label maps: pixels that belong to no region and are left out of every score
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -250,7 +250,6 @@ class Regions:
         """Paint the regions of one view into one frame.
 
         Args:
-            view: view index.
             values: (D,) int64, what to paint for each region; regions with value 0 or less are left out.
             size: width and height of the frame, pixels.
 

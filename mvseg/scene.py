@@ -36,11 +36,11 @@ from mvseg.errors import InputError
 if TYPE_CHECKING:
     import pycolmap
 
-ROTATION_TOLERANCE = 1e-4  # |R R^T - I|; hand-typed rig files carry about six digits
-MIN_FOCAL, MAX_PX = 1e-3, 1e9  # of K, pixels; far beyond any lens, and products of them are still numbers
-UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
-LEVEL, UPSIDE_DOWN = 0.17, -0.7  # means: sine of the pitch of level cameras, cosine between their up and the world's
-MAX_WORLD = 1e12  # of t, world units: millimetres on a map of the whole earth fit
+ROTATION_TOLERANCE = 1e-4  # limit: |R R^T - I|; hand-typed rig files carry about six digits
+MIN_FOCAL, MAX_PX = 1e-3, 1e9  # limit: of K, pixels; far beyond any lens, and products of them are still numbers
+UNIT_DIAGONAL = 700.0  # definition: pixels of the photo's diagonal per unit
+LEVEL, UPSIDE_DOWN = 0.17, -0.7  # chosen: sine of the pitch of level cameras; cosine of their up and the world's
+MAX_WORLD = 1e12  # limit: of t, world units: millimetres on a map of the whole earth fit
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -118,7 +118,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 42_100, "benchmarks": 6_800, "tests": 36_450}
+BUDGET = {"mvseg": 42_150, "benchmarks": 6_800, "tests": 36_500}
 SLACK = 400
 
 
@@ -221,14 +221,57 @@ def numbers_at_the_head(source: str) -> set[str]:
     return {target.id for target in numbers if isinstance(target, ast.Name)}
 
 
-def test_numbers_of_a_room_stand_in_one_place_and_each_has_a_sentence() -> None:
+def test_numbers_of_a_room_stand_in_one_place() -> None:
     assert numbers_at_the_head("a = 1\nB, C = 0.5, 'x'\nD = -1\nE = (1, 2)") == {"a", "B"}
     heads = {module: numbers_at_the_head(source) for module, source in MODULES.items() if room_of(module) in NUMBERED}
     assert {module for module, names in heads.items() if names} == BESIDE
-    for room in NUMBERED:
-        lines = [line for line in MODULES[f"mvseg.{room}.numbers"].splitlines() if re.match(r"    \w+: ", line)]
-        assert lines
-        assert [line for line in lines if not re.search(r" = .+  # \w.+", line)] == []
+
+
+WORDS = "definition", "limit", "fitted", "insensitive", "chosen"
+
+
+def is_number(value: ast.expr | None) -> bool:
+    """Whether an expression is made of numbers alone."""
+    if isinstance(value, ast.Constant):
+        return type(value.value) in (int, float)
+    parts = [each for each in ast.iter_child_nodes(value) if isinstance(each, ast.expr)] if value is not None else []
+    kinds = ast.UnaryOp | ast.BinOp | ast.Tuple | ast.List
+    return isinstance(value, kinds) and bool(parts) and all(map(is_number, parts))
+
+
+def words_of_numbers(source: str, *, fields: bool = False) -> dict[str, str]:
+    """{name: comment} of the numbers of a module, in the line or right above it; `fields` are those of classes."""
+    lines, tree = source.splitlines(), ast.parse(source)
+    nodes = [node for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and is_number(node.value)]
+    if fields:
+        nodes += [node for each in tree.body if isinstance(each, ast.ClassDef) for node in each.body
+                  if isinstance(node, ast.AnnAssign) and node.value is not None]  # fmt: skip
+    found = {}
+    for node in nodes:
+        above = node.lineno - 1
+        while above and lines[above - 1].lstrip().startswith("#"):
+            above -= 1
+        told = [*lines[node.lineno - 1 : node.end_lineno], *lines[above : node.lineno - 1]]
+        target = node.targets[0] if isinstance(node, ast.Assign) else node.target
+        found[ast.unparse(target)] = " ".join(re.findall(r"# (?!fmt)(.*)", "\n".join(told)))
+    return found
+
+
+def test_the_comment_of_a_number_begins_with_one_of_five_words() -> None:
+    """A number that was fitted names the command that fits it."""
+    assert words_of_numbers("A = 1  # limit: x\n# chosen: y\n# z\nB = (1, -2)\nC = 'text'\nD = 2 * 3") == {
+        "A": "limit: x", "B": "chosen: y z", "D": ""
+    }  # fmt: skip
+    numbers = {
+        (module, name): comment
+        for module, source in MODULES.items()
+        for name, comment in words_of_numbers(source, fields=module.endswith(".numbers")).items()
+    }
+    assert len(numbers) > 500
+    begun = re.compile(rf"(?:{'|'.join(WORDS)})\b")
+    assert [place for place, comment in numbers.items() if not begun.match(comment)] == []
+    fitted = {place: comment for place, comment in numbers.items() if re.match(r"fitted\b", comment)}
+    assert [place for place, comment in fitted.items() if not re.search(r"python|the same", comment)] == []
 
 
 def typed_homes(package: str) -> dict[str, str]:

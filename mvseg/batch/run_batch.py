@@ -21,7 +21,7 @@ from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_ab
 from mvseg.system.running import progress_bar
 from mvseg.system.say import say_beside_bars
 
-SHOWN = 4  # names of running scenes beside the progress bar
+SHOWN = 4  # limit: names of running scenes beside the progress bar
 
 
 @dataclass(frozen=True)

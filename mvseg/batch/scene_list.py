@@ -66,7 +66,6 @@ def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene
         source: a CSV table with a column `scene`, the path of a scene folder that starts at the table's own folder, and
             perhaps `name`, `masks`, `corrections`, `plant`, `time` and others; or a folder with one scene in each
             sub-folder. Hidden sub-folders, and `out`, are none.
-        out: folder of the results.
         masks: of the scenes for which the table names none.
 
     Raises:

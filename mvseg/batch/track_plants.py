@@ -74,14 +74,11 @@ def track_plants(
     One plant is in memory at a time in each process. A plant that fails has a `sentence`; the others continue.
 
     Args:
-        plants: see `list_plants`.
         out: the tables of `write_tables`, tracks.html and run.json; of several plants, the pages
             lie in `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
-        pots: see `track_leaves`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
-        report: write the pages, too.
 
     Raises:
         InputError: `out` cannot be written, or holds something else or tracks of other results; the corrections are

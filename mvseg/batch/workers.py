@@ -32,7 +32,7 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 Started = Callable[[int], object]
 Engine = Callable[[Mapping[int, Any], Started], Generator[tuple[int, Any], None, None]]
-TIMEOUT = 30  # seconds, for a Dask scheduler to answer
+TIMEOUT = 30  # limit: seconds, for a Dask scheduler to answer
 
 
 @dataclass(frozen=True)

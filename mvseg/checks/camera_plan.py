@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from mvseg.checks.cameras import Coverage
 from mvseg.scene import Scene
 
-SIDE, MARGIN = 900, 90  # pixels of the picture
-ARROW = 0.12  # length of an arrow, of the picture's side
-PAPER, INK, FAULT, POINT = (255, 255, 255), (60, 60, 60), (215, 48, 39), (26, 152, 80)  # RGB
+SIDE, MARGIN = 900, 90  # limit: pixels of the picture
+ARROW = 0.12  # limit: length of an arrow, of the picture's side
+PAPER, INK, FAULT, POINT = (255, 255, 255), (60, 60, 60), (215, 48, 39), (26, 152, 80)  # limit: RGB
 
 
 def draw_cameras(scene: Scene, coverage: Coverage, off: tuple[int, ...] = ()) -> NDArray[np.uint8]:

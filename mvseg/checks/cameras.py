@@ -18,7 +18,7 @@ from mvseg.verification.numbers import ROUGH
 Floats = NDArray[np.float64]
 
 DEPTHS = np.geomspace(0.02, 500, 80)  # depths of candidate points, in the median distance of two cameras
-GRID = (0.25, 0.5, 0.75)  # places of the rays with the candidate points, as shares of the photo's width and height
+GRID = (0.25, 0.5, 0.75)  # chosen: places of rays with candidate points, in the photo's width and height
 UNITS = {1000: "millimetres and metres", 100: "centimetres and metres", 10: "millimetres and centimetres"}
 FLIP = np.diag([1.0, -1.0, -1.0])  # from cameras that look along -z with +y up (OpenGL, Blender)
 

@@ -68,7 +68,6 @@ def check_scene(
 
     Args:
         scene: of V views; photos may be absent.
-        regions: its masks.
         photos: of the scene, where somebody has read them; None: they are read.
         features: compare features of neighbouring photos with the cameras, which takes about 0.1 s per photo.
         is_detected: a detector found the masks in these photos, so they are of no others.

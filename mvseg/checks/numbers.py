@@ -16,40 +16,40 @@ class CameraNumbers:
 
     most_sources: int = 32  # limit: cameras whose rays give candidate points, at most
     points_at_once: int = 4096  # limit: candidate points at a time; their number bounds the memory
-    all: float = 0.9  # share of the cameras that look at one point, at least, if poses are right
-    most: float = 0.6  # the same, below which another reading of the poses that is right is the better one
-    wider: int = 4  # factor of the angle between cameras from which such a reading is the better one, too
-    field_of_view: tuple[float, float] = (2.0, 140.0)  # degrees along the diagonal, at least and at most: no fisheyes
-    off_center: float = 0.2  # distance of a principal point from the middle, as a share of the side, at most
-    square: float = 1.2  # quotient of the focal lengths along x and y, at most
-    far: float = 8.0  # distance of a camera from the middle of the others, in their median distance, at most
-    gap: float = 3.0  # quotient of two lengths of t between which the unit may change, at least
-    alike: float = 2.0  # quotient of the distances of two groups of cameras in one unit, at most
-    narrow: float = 2.0  # degrees between the most different rays, below which there is no depth
-    wide: float = 75.0  # degrees between the rays of neighbouring views, above which they share no leaves
+    all: float = 0.9  # chosen: share of the cameras that look at one point, at least, if poses are right
+    most: float = 0.6  # chosen: the same, below which another reading of the poses that is right is the better one
+    wider: int = 4  # chosen: factor of the angle between cameras from which such a reading is the better one, too
+    field_of_view: tuple[float, float] = (2.0, 140.0)  # chosen: degrees along the diagonal, no fisheyes
+    off_center: float = 0.2  # chosen: distance of a principal point from the middle, as a share of the side, at most
+    square: float = 1.2  # chosen: quotient of the focal lengths along x and y, at most
+    far: float = 8.0  # chosen: distance of a camera from the middle of the others, in their median distance, at most
+    gap: float = 3.0  # chosen: quotient of two lengths of t between which the unit may change, at least
+    alike: float = 2.0  # chosen: quotient of the distances of two groups of cameras in one unit, at most
+    narrow: float = 2.0  # chosen: degrees between the most different rays, below which there is no depth
+    wide: float = 75.0  # chosen: degrees between the rays of neighbouring views, above which they share no leaves
 
 
 @dataclass(frozen=True)
 class AgreementNumbers:
     """Masks of two views fit if they begin and end at the same epipolar lines, better than by chance."""
 
-    num_moves: int = 16  # moves of a view's masks, which show what chance does
+    num_moves: int = 16  # limit: moves of a view's masks, which show what chance does
     most_partners: int = 20  # limit: views that each view is compared with, about
     most_offset: int = 40  # limit: units that lines may miss by, tried in both directions
     widest: float = 1.5  # limit, radians: part of the pencil that a mask fills; with more it holds the epipole
-    sharpness: float = 2.0  # width of a vote for an offset, in units
-    off: float = 0.22  # share of a view's masks that fit, below which the view agrees with none if lines miss, too
-    offset: float = 1.5  # units from which lines miss
-    most_agree: float = 0.3  # quantile of the offsets over the other views: noise alone puts some of them at 0
-    few_masks: int = 10  # masks of two views, in the median, to be sure: one faulty mask is too large a share of fewer
-    few_views: int = 4  # views to be sure: of fewer, none is outvoted
-    chance: float = 0.06  # share of the masks that fit where poses and masks have nothing to do with each other
-    apart: float = 0.5  # share that fits between two worlds, in that within them, at most; in one world, more fit
+    sharpness: float = 2.0  # chosen: width of a vote for an offset, in units
+    off: float = 0.22  # chosen: share of fitting masks below which a view agrees with none, if lines miss
+    offset: float = 1.5  # chosen: units from which lines miss
+    most_agree: float = 0.3  # chosen: quantile of the offsets over the other views: noise alone puts some of them at 0
+    few_masks: int = 10  # chosen: masks of two views (median), to be sure; of fewer, one faulty mask is too many
+    few_views: int = 4  # chosen: views to be sure: of fewer, none is outvoted
+    chance: float = 0.06  # chosen: share of the masks that fit where poses and masks have nothing to do with each other
+    apart: float = 0.5  # chosen: fitting share between two worlds, relative to that within them, at most
     smallest: int = 2  # definition: views of a group; one alone is for `view_agreement`
     # On 65 real plants and dates with sound masks it is 0.47 and more, but for 0.28 on a basil of 30 leaves that hide
     # each other; where the masks of a simulated plant are turned, it is 0.29 and 0.26.
-    low: float = 0.4  # share that fits in the median view, below which a user is told
-    turned: int = 2  # quotient of the same with turned masks and as they are, above which they were drawn turned
+    low: float = 0.4  # chosen: share that fits in the median view, below which a user is told
+    turned: int = 2  # chosen: ratio of fits of turned masks and of those as they are: drawn turned
 
 
 @dataclass(frozen=True)
@@ -58,44 +58,44 @@ class FeatureNumbers:
 
     side: int = 800  # limit: pixels of the longer side of photos in which features are found
     most_features: int = 1500  # limit: features of a photo, at most
-    contrast: float = 0.013  # contrast of a feature, at least: leaves have less than OpenCV's default of 0.04
-    best_angle: float = 15.0  # degrees between two views that are matched: above, fewer features are the same
-    widest_angle: float = 60.0  # the same, at most
-    partners: int = 4  # views that a view is matched with: wrong cameras are wrong about what is near, too
+    contrast: float = 0.013  # chosen: contrast of a feature, at least: leaves have less than OpenCV's default of 0.04
+    best_angle: float = 15.0  # chosen: degrees between two views that are matched: above, fewer features are the same
+    widest_angle: float = 60.0  # chosen: the same, at most
+    partners: int = 4  # chosen: views that a view is matched with: wrong cameras are wrong about what is near, too
     most_views: int = 24  # limit: views of which each is matched with others, at most
     sources: int = 8  # limit: views that are matched with others where there are more
-    still: float = 3.0  # units up to which features stand still, as the wall behind a turntable
-    tolerance: float = 1.0  # units that a feature may miss a fundamental matrix by
-    fewest: int = 20  # features that fit one fundamental matrix, at least; 40 with nothing in common give 13
-    least_share: float = 0.5  # the same, as a share of all features that have moved
-    offset: float = 1.5  # units that features of right cameras may miss their epipolar lines by
-    contradicts: float = 0.3  # share of these that fit the cameras', below which cameras are wrong
-    agrees: float = 0.6  # the same, above which they agree
-    fewest_pairs: int = 3  # pairs of photos that judge a focal length, at least
-    least_error: float = 0.05  # change of its logarithm, at least
-    better: float = 0.5  # epipolar distance with another focal length, in that with the given one, at most
-    most: float = 0.7  # share of the pairs for which it is better, and in which features fit, at least
+    still: float = 3.0  # chosen: units up to which features stand still, as the wall behind a turntable
+    tolerance: float = 1.0  # chosen: units that a feature may miss a fundamental matrix by
+    fewest: int = 20  # chosen: features that fit one fundamental matrix, at least; 40 with nothing in common give 13
+    least_share: float = 0.5  # chosen: the same, as a share of all features that have moved
+    offset: float = 1.5  # chosen: units that features of right cameras may miss their epipolar lines by
+    contradicts: float = 0.3  # chosen: share of these that fit the cameras', below which cameras are wrong
+    agrees: float = 0.6  # chosen: the same, above which they agree
+    fewest_pairs: int = 3  # chosen: pairs of photos that judge a focal length, at least
+    least_error: float = 0.05  # chosen: change of its logarithm, at least
+    better: float = 0.5  # chosen: epipolar distance with another focal length, in that with the given one, at most
+    most: float = 0.7  # chosen: share of the pairs for which it is better, and in which features fit, at least
 
 
 @dataclass(frozen=True)
 class ImageNumbers:
     """Masks and photos on their own, and shapes of the target in photos."""
 
-    tiny_px: int = 30  # pixels of a mask that carries information, at least
-    many: float = 0.25  # share of the masks that are tiny or cut by the border, above which a user is told
-    few: float = 0.34  # masks of a view, in their median number, below which some may be missing
-    small_component: float = 0.002  # size of a component that does not count, as a share of its mask's pixels, at most
-    beyond: float = 0.1  # reach of stray pixels beyond a mask, as a share of the photo's longer side, at most
-    blank: float = 4.0  # standard deviation of grey levels of a photo of nothing, at most
-    blank_share: float = 0.03  # the same of a dark one, as a share of its level: photos of something have a fifth
-    rounding: float = 1.0  # the same that rounding makes
-    dark: int = 30  # grey level below which 99 % of the pixels of a dark photo are
-    stops: float = 1 / 3  # exposures between two photos that are noted: the least step of a camera's dials
-    burnt: float = 0.7  # share of white pixels above which a photo is overexposed
-    gamma: float = 2.2  # exponent of light in photos, about: blur mixes light, so edges are where it is halfway
-    smooth_px: float = 4.0  # pixels over which light hardly changes, unlike ink and paper at an edge
+    tiny_px: int = 30  # chosen: pixels of a mask that carries information, at least
+    many: float = 0.25  # chosen: share of the masks that are tiny or cut by the border, above which a user is told
+    few: float = 0.34  # chosen: masks of a view, in their median number, below which some may be missing
+    small_component: float = 0.002  # chosen: component that does not count, relative to its mask's pixels
+    beyond: float = 0.1  # chosen: reach of stray pixels beyond a mask, as a share of the photo's longer side, at most
+    blank: float = 4.0  # chosen: standard deviation of grey levels of a photo of nothing, at most
+    blank_share: float = 0.03  # chosen: the same of a dark photo, relative to its level; real photos have 0.2
+    rounding: float = 1.0  # definition: the same that rounding makes
+    dark: int = 30  # chosen: grey level below which 99 % of the pixels of a dark photo are
+    stops: float = 1 / 3  # chosen: exposures between two photos that are noted: the least step of a camera's dials
+    burnt: float = 0.7  # chosen: share of white pixels above which a photo is overexposed
+    gamma: float = 2.2  # definition: exponent of light in photos: blur mixes light, edges are where it is halfway
+    smooth_px: float = 4.0  # chosen: pixels over which light hardly changes, unlike ink and paper at an edge
     shift: int = 4  # limit: bits of a pixel's fraction in OpenCV's polygons
-    least_iou: float = 0.75  # IoU of a mask with its shape, at least: shapes have 0.93 and more, noise up to 0.72
+    least_iou: float = 0.75  # chosen: IoU of a mask with its shape; shapes have 0.93 and more, noise up to 0.72
 
 
 CAMERAS = CameraNumbers()

@@ -77,10 +77,6 @@ def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
 
     Masks that touch the border are left out: where they would end is not known. With more than 20 other views, each is
     compared with 20 or more of them.
-
-    Args:
-        regions: D regions in V views.
-        cameras: V >= 2 cameras.
     """
     num_views = len(cameras)
     regions, cameras = regions.to("cpu"), cameras.to("cpu")

@@ -8,7 +8,7 @@ from io import TextIOWrapper
 
 from mvseg.system.say import say
 
-INTERRUPTED = 130
+INTERRUPTED = 130  # definition: exit code after Ctrl-C, as shells have it
 __all__ = ["main"]
 
 

@@ -9,7 +9,7 @@ from jsonargparse import ArgumentParser, Namespace
 from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run, read_workers
 from mvseg.system.say import say
 
-SOME_FAILED = 3
+SOME_FAILED = 3  # definition: exit code where some scenes failed
 
 
 def add_options(parser: ArgumentParser) -> None:

@@ -20,7 +20,7 @@ from mvseg.system.say import say
 if TYPE_CHECKING:
     from mvseg.checks.check_scene import Check
 
-WRONG = 1  # exit code
+WRONG = 1  # definition: exit code
 CHECK_FILE, PLAN_FILE, TARGET_FILE = "check.json", "cameras.png", "target.json"
 
 

@@ -23,7 +23,7 @@ from mvseg.system.running import running
 from mvseg.system.say import say
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
-TERMINATED = 143
+TERMINATED = 143  # definition: exit code after SIGTERM, as shells have it
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 # Each with a few words; `--help` of a verb begins with its docstring.
 VERBS: dict[str, tuple[ModuleType, str]] = {

@@ -8,7 +8,7 @@ from difflib import get_close_matches
 
 from mvseg.system.say import say
 
-BAD_INPUT = 2
+BAD_INPUT = 2  # definition: exit code of bad input
 
 
 # What jsonargparse says of a value of a wrong type: the option, the types that would be right, and the value.
@@ -25,7 +25,6 @@ def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence
     """Print what is wrong with the input, on one line; returns the exit code.
 
     Args:
-        error: with the sentence.
         arguments: of the command line; an option among them is named as it stands there.
         known: verbs or options, one of which was perhaps meant by a name that nothing has.
     """

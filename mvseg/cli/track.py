@@ -18,7 +18,7 @@ from mvseg.tracking.config import Pots
 if TYPE_CHECKING:
     from mvseg.tracking.recorded import RecordedTracks
 
-SOME_FAILED = 3
+SOME_FAILED = 3  # definition: exit code where some plants failed
 LEAST_NAME = 4  # chosen: characters of a plant's name; "day" is none
 
 

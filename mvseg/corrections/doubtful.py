@@ -84,10 +84,7 @@ def list_doubts(
     every other mask once.
 
     Args:
-        masks: D masks, matched.
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
-        cameras: V cameras.
-        left: candidates that were not chosen.
         photos: photos of the views; None: nobody looks for places without masks.
     """
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")

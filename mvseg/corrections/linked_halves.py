@@ -36,7 +36,6 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
     Args:
         corrected: D masks and their links.
         before: the masks before the edits, on the CPU, with the ids that the person saw.
-        cameras: V cameras on the CPU.
 
     Returns:
         The same with more links; a link that would contradict those of the person is left out.

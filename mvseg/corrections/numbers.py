@@ -17,47 +17,47 @@ class EditNumbers:
     most_points: int = 10_000  # limit: points of an outline or a line, and places of a link of dates, at most
     most_places: int = 100  # limit: places of a link, at most: each is held against each other
     covered: float = 0.5  # definition: share of a mask above which an outline that covers it replaces it
-    most_covered: int = 3  # masks that an outline replaces without a word: two stems before a leaf make three pieces
-    least_halves: int = 2  # photos that show two instances, from which a link between them may be about both
-    touches: float = 0.02  # distance of the surfaces of two halves, as a fraction of the length of the first, at most
-    as_near: float = 1.1  # distance of the outline of one surface that fits as well as two, in theirs, at most
+    most_covered: int = 3  # chosen: masks that an outline replaces silently: two stems make three pieces
+    least_halves: int = 2  # chosen: photos that show two instances, from which a link between them may be about both
+    touches: float = 0.02  # chosen: distance of the surfaces of two halves, in lengths of the first
+    as_near: float = 1.1  # chosen: distance of the outline of one surface that fits as well as two, in theirs, at most
     fine: int = 4  # limit: bits of a pixel's fraction, along a cut
-    touches_px: int = 2  # gap between two masks of one leaf in one photo, at most, where they hang together
+    touches_px: int = 2  # chosen: gap between two masks of one leaf in one photo, at most, where they hang together
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
-    around: float = 0.35  # margin around the rough outline that is part of it, as a share of its size
-    least_margin_px: float = 4.0  # the same in pixels of the photo, at least
-    least_pixels: int = 16  # pixels of that part within the rough outline, at least
-    rounds: int = 5  # rounds of GrabCut
-    least_leaf: float = 0.05  # size of the leaf, as a share of the rough outline's pixels, at least
-    tolerance_px: float = 1.0  # distance of the outline from the edge of the leaf, in pixels of the part, at most
+    around: float = 0.35  # chosen: margin around the rough outline that is part of it, as a share of its size
+    least_margin_px: float = 4.0  # chosen: the same in pixels of the photo, at least
+    least_pixels: int = 16  # chosen: pixels of that part within the rough outline, at least
+    rounds: int = 5  # limit: rounds of GrabCut
+    least_leaf: float = 0.05  # chosen: size of the leaf, as a share of the rough outline's pixels, at least
+    tolerance_px: float = 1.0  # chosen: distance of the outline from the leaf's edge, pixels of the part
 
 
 @dataclass(frozen=True)
 class DoubtNumbers:
     """What a person is asked, also of places that have the colour of leaves and no mask. Doubts only sort questions."""
 
-    least: float = 0.3  # doubt from which a question is asked
-    most: int = 200  # questions of a page, at most: it asks a few itself, and the others where a person clicks
+    least: float = 0.3  # chosen: doubt from which a question is asked
+    most: int = 200  # limit: questions of a page, at most: it asks a few itself, and the others where a person clicks
     digits: int = 6  # limit: decimals of what an answer changes; what differs in later ones is a tie
-    as_good: float = 0.1  # match score below the best one down to which masks show a leaf as well; the largest is shown
-    lone: float = 0.6  # doubt of a mask that was matched to nothing, at most
-    missing: float = 0.8  # doubt where a mask is missing, at most
-    covered: float = 0.9  # doubt where a mask of another leaf is in the place of one, at most
-    unmasked: float = 0.8  # doubt of such a place
-    open: float = 0.5  # unhidden share of a surface from which a view should show a mask; see `EVIDENCE.open_pixels`
-    empty: float = 0.6  # share of that part outside of all masks from which the mask is missing
-    similar: float = 0.4  # IoU of that part with a mask of another leaf from which the mask may be the missing one
-    surely: float = 0.8  # the same, from which nothing else is likelier
-    smooth_px: float = 1.5  # distance of a proposed outline from the edge that it follows, at most
-    least_chance: float = 0.1  # probability of being a leaf from which a candidate that was not chosen is asked about
-    half: float = 0.5  # size of a place beside a mask, as a share of the mask, from which this may show half a leaf
-    least_halves: int = 3  # photos from which that is asked: one mask may as well touch another leaf
-    most_places: int = 12  # places that one question shows, at most
+    as_good: float = 0.1  # chosen: match score below the best from which masks are as good; the largest is shown
+    lone: float = 0.6  # chosen: doubt of a mask that was matched to nothing, at most
+    missing: float = 0.8  # chosen: doubt where a mask is missing, at most
+    covered: float = 0.9  # chosen: doubt where a mask of another leaf is in the place of one, at most
+    unmasked: float = 0.8  # chosen: doubt of such a place
+    open: float = 0.5  # chosen: unhidden share of a surface that should have a mask; see `EVIDENCE.open_pixels`
+    empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
+    similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one
+    surely: float = 0.8  # chosen: the same, from which nothing else is likelier
+    smooth_px: float = 1.5  # chosen: distance of a proposed outline from the edge that it follows, at most
+    least_chance: float = 0.1  # chosen: P from which a candidate that was not chosen is asked about
+    half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
+    least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf
+    most_places: int = 12  # limit: places that one question shows, at most
     looked_px: int = 600  # limit: longer side of a photo in which places are looked for
-    opening: int = 5  # width of a place in these pixels, at least: stems are thinner, and seams beside masks
-    compact: float = 0.25  # square of its largest width, as a share of its area, at least: stems have less
-    beside: int = 3  # distance between a mask and what it leaves out of its leaf, in these pixels, at most
-    most_share: float = 0.2  # size of a place, as a share of the photo, at most; of what is larger, its widest place
+    opening: int = 5  # chosen: width of a place in these pixels, at least: stems are thinner, and seams beside masks
+    compact: float = 0.25  # chosen: square of its largest width, as a share of its area, at least: stems have less
+    beside: int = 3  # chosen: distance between a mask and what it leaves out of its leaf, in these pixels, at most
+    most_share: float = 0.2  # chosen: size of a place, relative to the photo; of larger ones the widest place
     widest: float = 1.5  # chosen: reach of that place from its middle, in radii of the largest circle in it
 
 

@@ -25,13 +25,6 @@ def settle(
     They are applied where they answer a question: a candidate that was not chosen is shown there, which goes if the
     edit is about all photos, or a surface, of which no mask is there.
 
-    Args:
-        edits: what came of all edits.
-        refused: where no leaf is.
-        left: candidates that were not chosen.
-        surfaces: {instance id: surface}.
-        cameras: V cameras.
-
     Returns:
         The candidates that are left, and the final fates.
     """

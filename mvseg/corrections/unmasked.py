@@ -42,7 +42,6 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
 
     Args:
         masks: D masks on the CPU, matched.
-        photos: photos of the views.
     """
     if not masks.num_instances:
         return []

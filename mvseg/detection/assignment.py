@@ -30,7 +30,6 @@ class EpipolarAssignment(nn.Module):
             proposals: R masks in V views.
             regions: D regions of the previous iteration.
             instance_ids: (D,) int64, their ids in [1, K]; -1 = matched to nothing.
-            cameras: V cameras.
 
         Returns:
             (R,) int64 id of the instance with the largest similarity, -1 where every similarity is 0, and (R,) float32,
@@ -61,9 +60,7 @@ def ruzicka_similarity(
 
     Args:
         proposals: R masks in V views.
-        regions: D regions.
         instance_ids: (D,) int64 in [1, K] or -1.
-        cameras: V cameras.
         max_pixels: thins the masks of the proposals; None takes all pixels.
 
     Returns:

@@ -100,7 +100,6 @@ def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterat
 
     Args:
         folder: made if it is missing; deleted in the end if nothing was cached.
-        scene: the scene folder.
         overwrite: take it also when it holds what was found in another scene's photos.
 
     Raises:

@@ -7,13 +7,13 @@ the paper.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from mvseg.detection.find_leaves import Found
 from mvseg.detection.numbers import DETECTION
 
 
-def choose_size(see: Callable[[int], Found], first: Found) -> Found:
+def choose_size(see: Callable[[int], Found], first: Found) -> list[Found]:
     """Look again and again at a smaller size, as long as the agreed area grows.
 
     Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), one size without
@@ -24,7 +24,7 @@ def choose_size(see: Callable[[int], Found], first: Found) -> Found:
         first: what was found at the usual size.
 
     Returns:
-        What was found where the agreed area is largest; of equals, at the larger size.
+        What was found at the best size, see `order_sizes`.
     """
     looked, size, num_misses = [first], float(first.looks[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
@@ -33,20 +33,26 @@ def choose_size(see: Callable[[int], Found], first: Found) -> Found:
         looked.append(found)
         if num_misses > (best.leaves.agreement < DETECTION.clear_agreement):
             break
-    return max(looked, key=lambda each: each.agreed_area)
+    return order_sizes(looked)
 
 
-def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> Found:
+def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> list[Found]:
     """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
 
     Args:
         see: finds leaves at a size, see `choose_size`.
-        size: pixels.
         most: pixels, the longer side of the photos: no size is larger.
 
     Returns:
-        What was found where the agreed area is largest; of equals, at the given size.
+        What was found at the best size, see `order_sizes`.
     """
     larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
     sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
-    return max(map(see, sizes), key=lambda found: found.agreed_area)
+    return order_sizes([see(each) for each in sizes])
+
+
+def order_sizes(looked: Sequence[Found]) -> list[Found]:
+    """What was found where the agreed area is largest; of equals, what comes first. And at the next best size, if some
+    of the views cannot tell the two apart (`DETECTION.as_good`): then all of them should."""
+    ordered = sorted(looked, key=lambda each: -each.agreed_area)
+    return [each for each in ordered[:2] if each.agreed_area >= DETECTION.as_good * ordered[0].agreed_area]

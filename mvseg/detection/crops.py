@@ -30,10 +30,6 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
     An instance is a ball around the point that its masks' boxes are centred on. A view's box holds the balls, and the
     masks of these instances in that view.
 
-    Args:
-        masks: D masks.
-        cameras: V cameras.
-
     Returns:
         (V, 4) int64 xyxy, half-open, with a margin, inside the photos. The whole photo where no instance is sure.
     """

@@ -40,8 +40,6 @@ def detect_scene(
     Args:
         photos: of the scene, with its cameras.
         config: which detector, at which size, and what it finds.
-        match: how detections are matched.
-        cache: of the detections.
         boxes: (V, 4) int64 xyxy, the parts of the photos that show the plant, from an earlier look; None: look for it.
 
     Returns:

@@ -138,10 +138,8 @@ def find_leaves(
 
     Args:
         looks: at the same photos, matched with the same cameras.
-        cameras: V cameras.
         config: `verify`, `min_score` and `min_probability`.
         splits: cut masks that seem to show two leaves, before the views choose.
-        cache: of surfaces, see `fit_surfaces`.
     """
     matched, proposals, offset = [], [], 0
     for look in looks:

@@ -36,10 +36,8 @@ def match_proposals(
         proposals: R scored masks of V views, the excessive set; objects of different classes are never matched.
         cameras: V cameras on the same device.
         boxes: (R, 4) float32 xyxy, what NMS compares; None: those of the masks.
-        num_iterations: rounds of assignment and NMS.
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
         detections_per_view: at most this many are kept in a view, best scores first.
-        match: how regions are matched.
         residual_px: the reprojection error, where an earlier matching with these cameras has found it; None: estimated.
 
     Returns:

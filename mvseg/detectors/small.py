@@ -19,10 +19,10 @@ from torchvision.ops import MultiScaleRoIAlign
 
 from mvseg.detectors.efficientnet_lite import LEVELS, LITE_SCALES, PIXEL_MEAN, PIXEL_STD, build_lite
 
-CHANNELS = 96
-BOX_FEATURES = 512
-IMAGE_SIZE = 512
-MASK_DILATIONS = (1, 2, 4, 1)
+CHANNELS = 96  # chosen: of the feature pyramid
+BOX_FEATURES = 512  # chosen: of the box head
+IMAGE_SIZE = 512  # chosen: longer side of a photo, pixels
+MASK_DILATIONS = (1, 2, 4, 1)  # chosen: of the convolutions of the mask head
 # architecture -> torchvision's classifier that its pyramid stands on
 SMALL_BACKBONES = {"resnet18_fpn": "resnet18", "mobilenet_v3_large_fpn": "mobilenet_v3_large"}
 SMALL_ARCHITECTURES = (*SMALL_BACKBONES, *LITE_SCALES)

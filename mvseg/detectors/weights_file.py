@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from mvseg.errors import InputError
 
 DETECTOR_FILE = "detector.safetensors"  # in a result folder: the weights that have learned its plant
-MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # pixels that photos are scaled to
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # limit: pixels that photos are scaled to
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from torch import Tensor
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.formats.run_lengths import encode_mask
 
-MAX_DETECTIONS = 100  # per photo, the best by score: COCO's limit, and that of torchvision's detectors
+MAX_DETECTIONS = 100  # definition: per photo, the best by score: COCO's limit, and that of torchvision's detectors
 
 Annotations = list[dict[str, Any]]
 

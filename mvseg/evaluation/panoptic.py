@@ -19,7 +19,7 @@ from mvseg.evaluation.id_metrics import contingency_table, count_pairs, share
 from mvseg.matching.partition import separate_unmatched
 from mvseg.regions import IGNORE_LABEL, Regions
 
-RIGHT_IOU = 0.5  # above it, a segment finds a true one: never two, because the true ones do not overlap
+RIGHT_IOU = 0.5  # definition: above it, a segment finds a true one: never two, because the true ones do not overlap
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,6 @@ def find_segments(
     """Which true segment each estimated one finds; of several that could, the one with the largest IoU does.
 
     Args:
-        regions: D masks.
         segments: (D,) int64 from 0 on without gaps, the segment that each mask is a part of.
         truth: V label maps.
         numbers: V mappings, label -> true segment, from 0 on without gaps.

@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 # Marker dictionaries, by OpenCV's names; the one with the most markers in the photos is used.
 Family = Literal["4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
-MAX_SQUARES = 200
+MAX_SQUARES = 200  # limit: squares along a side of a board
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,6 @@ def find_views(
 
     Args:
         names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
-        scene: gives the views.
         source: the file or folder that holds the names; messages name it. None: they do not.
         warn_of_loose: warn (InputWarning) of names that were matched by their base name alone.
 

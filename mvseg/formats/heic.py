@@ -17,7 +17,7 @@ from mvseg.errors import InputError
 SUFFIXES = (".heic", ".heif")
 BRANDS = (b"heic", b"heix", b"mif1", b"msf1", b"hevc", b"heim")  # of the file, in its bytes 8 to 12
 TURN = "turn"  # in an image's info: how the decoder turns it, 1 to 8 as in EXIF
-QUARTERS = (1, 8, 3, 6)  # a turn by 0 to 3 quarters, anticlockwise, as in EXIF
+QUARTERS = (1, 8, 3, 6)  # definition: a turn by 0 to 3 quarters, anticlockwise, as in EXIF
 
 
 def open_heic(file: IO[bytes]) -> ImageFile:

@@ -34,14 +34,14 @@ from mvseg.formats.heic import BRANDS, TURN, open_heic
 from mvseg.formats.heic import SUFFIXES as HEIC_SUFFIXES
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIC_SUFFIXES)
-MAX_SIDE = 1 << 20  # pixels
-MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
-GREY = 2  # largest difference between the channels of a grey photo
-ORIENTATION = 0x0112  # EXIF tag, and TIFF's
+MAX_SIDE = 1 << 20  # limit: pixels
+MAX_PIXELS = 1 << 28  # limit: more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
+GREY = 2  # chosen: largest difference between the channels of a grey photo
+ORIENTATION = 0x0112  # definition: EXIF tag, and TIFF's
 BACK = {6: 8, 8: 6}  # the orientation that undoes another; the others undo themselves
-EXPOSURE_BLOCK, SECONDS, APERTURE, ISO = 0x8769, 0x829A, 0x829D, 0x8827  # EXIF tags
-BITS_PER_SAMPLE = 0x0102  # TIFF tag
-LARGE = 1 << 26  # pixels; Pillow's own limit lies above
+EXPOSURE_BLOCK, SECONDS, APERTURE, ISO = 0x8769, 0x829A, 0x829D, 0x8827  # definition: EXIF tags
+BITS_PER_SAMPLE = 0x0102  # definition: TIFF tag
+LARGE = 1 << 26  # limit: pixels; Pillow's own limit lies above
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # These formats only: among Pillow's others is one (EPS) that runs a program.
@@ -68,7 +68,6 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """Decode a JPEG, PNG, TIFF, BMP, WebP or HEIC file, recognised by its content; the first image of several.
 
     Args:
-        path: the file.
         size: width and height that the image must have, in this or the other order; another one is not decoded.
 
     Returns:
@@ -150,8 +149,6 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
     those; see `sensor_bits`.
 
     Args:
-        path: the file.
-        size: see `read_image`.
         bits: least number of bits that a 16-bit file is taken to use: that of the other photos, so that a dark photo
             stays darker than they are.
 

@@ -21,10 +21,10 @@ from mvseg.formats.image_file import WrongSize, read_deep, read_image, write_png
 from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.regions import IGNORE_LABEL
 
-MAX_COLOURS = 1000  # more than leaves on a photo; photos and blurred masks have far more
-CHUNK = 1 << 24  # pixels
-VOC_BORDER = 255  # index, in palette PNGs
-VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # of that index
+MAX_COLOURS = 1000  # limit: more than leaves on a photo; photos and blurred masks have far more
+CHUNK = 1 << 24  # limit: pixels
+VOC_BORDER = 255  # definition: index, in palette PNGs
+VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # definition: of that index
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:

@@ -18,7 +18,7 @@ import pycolmap
 
 from mvseg.errors import InputError
 
-CHUNK = 1 << 20  # pixels at a time: all of a photo of 24 megapixels would take 3 GB
+CHUNK = 1 << 20  # limit: pixels at a time: all of a photo of 24 megapixels would take 3 GB
 
 Mapping = Callable[[pycolmap.Camera, np.ndarray, np.ndarray], np.ndarray]
 

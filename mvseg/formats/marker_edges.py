@@ -18,7 +18,7 @@ from scipy.ndimage import map_coordinates
 Floats = NDArray[np.float64]
 
 ALONG = np.linspace(-0.3, 0.3, 5)  # where an edge between two modules is looked at, in modules from its middle
-PASSES = 3  # OpenCV's quads are right to a pixel or two; the third pass moves corners by 0.002 pixels
+PASSES = 3  # limit: OpenCV's quads are right to a pixel or two; the third pass moves corners by 0.002 pixels
 ACROSS = np.linspace(-0.5, 0.5, 25)  # in modules, from the middle of one to that of the other
 
 

@@ -67,7 +67,6 @@ def write_glb(
     and a double-sided material of its own: a leaf may be an open surface.
 
     Args:
-        path: the file.
         meshes: {name: mesh}.
         colors: {name: RGB, 0 to 255}, sRGB; the file has them linear, as glTF requires.
         matrix: (4, 4) gltf_from_world; glTF is in metres, +y is up. None: the identity.

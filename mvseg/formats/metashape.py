@@ -28,8 +28,8 @@ from mvseg.formats.photos import Photo, build_scene, find_photo
 from mvseg.formats.text_file import read_bytes
 from mvseg.scene import ROTATION_TOLERANCE, Scene
 
-MAX_BYTES = 1 << 26
-GEOCENTRIC = 1e5  # metres from the origin, beyond which float32 does not resolve millimetres
+MAX_BYTES = 1 << 26  # limit: bytes of a file
+GEOCENTRIC = 1e5  # chosen: metres from the origin, beyond which float32 does not resolve millimetres
 CAMERAS = "cameras//camera"  # those in groups, too; not the photos of a project's frames
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
 UNKNOWN_NAMES = ("k4", "p3", "p4")  # numbers of the lens that OpenCV's model does not have

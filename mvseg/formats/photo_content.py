@@ -8,8 +8,8 @@ import numpy as np
 
 from mvseg.formats.image_file import is_grey
 
-STEP = 4  # every fourth row and column is used
-WHITE = 250  # a pixel is white if all of its channels reach this value
+STEP = 4  # limit: every fourth row and column is used
+WHITE = 250  # chosen: a pixel is white if all of its channels reach this value
 
 
 @dataclass(frozen=True)

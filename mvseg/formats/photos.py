@@ -32,7 +32,7 @@ from mvseg.system.file_hash import hash_files
 
 ReadPhoto = Callable[[int], NDArray[np.uint8]]  # view index -> (H, W, 3) RGB, undistorted: `Photos`, or a stand-in
 
-CACHED_BYTES = 256 * 2**20  # 12 photos of 7 megapixels
+CACHED_BYTES = 256 * 2**20  # limit: 12 photos of 7 megapixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,6 @@ def build_scene(
     """The scene of a folder from its photos.
 
     Args:
-        folder: the scene; see `scene_name`.
-        photos: one per view.
         unit: of the world, "" when unknown.
         source: the file or folder that the cameras come from; messages name it.
         up: the direction of the world that points up, None when unknown.

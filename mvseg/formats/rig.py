@@ -28,7 +28,7 @@ from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import Scene
 
 RIG_FORMAT = "mvseg-rig/1"
-MANY = 10  # unknown keys of one view that are named
+MANY = 10  # limit: unknown keys of one view that are named
 
 
 class RigCamera(BaseModel):

@@ -12,7 +12,7 @@ from pydantic import BaseModel, NonNegativeInt
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items
 
-MOST_CHARACTERS = 8  # of a number: 40 bits are more pixels than any image has
+MOST_CHARACTERS = 8  # limit: of a number: 40 bits are more pixels than any image has
 
 
 class Rle(BaseModel):

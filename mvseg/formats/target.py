@@ -19,14 +19,14 @@ from mvseg.system.atomic import write_whole
 
 Floats = NDArray[np.float64]
 
-WIDTH, HEIGHT = 210.0, 297.0
+WIDTH, HEIGHT = 210.0, 297.0  # definition: of an A4 page, mm
 FAMILY: Family = "APRILTAG_36H11"
 PAGE = Path(__file__).with_suffix(".pdf")
 INK = "0.8353 0.0000 0.4706 rg\n"  # the colour of the shapes, as the page sets it: unlike wood, soil, skin and leaves
-TAG = 25.0  # side of a tag's black square
-TAG_COLUMNS, TAG_ROWS = (12.0, 65.0, 120.0, 173.0), (12.0, 125.0, 238.0)  # their left and upper edges
-BAR = 100.0  # length of the scale bar
-PAPER = 4.0  # around each shape, nothing else is printed
+TAG = 25.0  # definition: side of a tag's black square
+TAG_COLUMNS, TAG_ROWS = (12.0, 65.0, 120.0, 173.0), (12.0, 125.0, 238.0)  # definition: their left and upper edges
+BAR = 100.0  # definition: length of the scale bar
+PAPER = 4.0  # definition: around each shape, nothing else is printed
 SIGN = b"(mvseg target: AprilTags"  # by which the page is known
 
 

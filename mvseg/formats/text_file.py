@@ -17,8 +17,8 @@ import yaml  # type: ignore[import-untyped]
 from mvseg.errors import InputError
 from mvseg.system.atomic import write_text_whole
 
-MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26
-MAX_DEPTH, MAX_DIGITS = 32, 400  # of YAML: PyYAML recurses as deep as Python's stack
+MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26  # limit: bytes of a file, and of a table
+MAX_DEPTH, MAX_DIGITS = 32, 400  # limit: of YAML: PyYAML recurses as deep as Python's stack
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 Cell = str | float | None

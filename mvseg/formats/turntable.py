@@ -116,7 +116,6 @@ def write_turntable(
         path: where; its folder must exist.
         cameras: width, height, K, R, t and distortion, as in a rig file, by name.
         views: file, camera and angle in degrees of each photo.
-        unit: of t.
     """
     content = {
         "format": TURNTABLE_FORMAT,

@@ -42,11 +42,9 @@ def region_affinity(regions: Regions, cameras: Cameras, *, num_points: int | Non
     """Affinity of all pairs of regions in different views (Eq. 3), symmetrised.
 
     Args:
-        regions: D regions in V views.
         cameras: V cameras. Pairs of views that share a camera centre are skipped: their regions get no edge.
         num_points: random pixels per region that send out epipolar lines (the paper: 200). None, the default, uses all
             pixels: no slower, and without sampling noise.
-        seed: for the random pixels.
 
     Returns:
         The graph, on the device of the regions. A region of weight 0 to all regions of the other views has no edge.

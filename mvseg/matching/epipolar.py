@@ -176,7 +176,6 @@ def binned_pairs(
 
     Args:
         samples: pixels of the regions, one entry per view.
-        cameras: V cameras.
         senders: the pixels that send out lines; None for all.
     """
     skip = is_coincident(cameras).tolist()
@@ -235,7 +234,6 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
 
     Args:
         regions: D regions; those of `view` itself, and of views that share its camera centre, have no band there.
-        cameras: V cameras.
         view: the view that the bands are projected onto.
         xy: (P, 2) float32 pixel positions in that view.
 
@@ -264,7 +262,6 @@ def epipolar_map(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -
 
     Args:
         regions: the members of the cluster. Members in `view` itself have no band there and do not count.
-        cameras: V cameras.
         view: the view that the map belongs to.
         xy: (P, 2) float32 pixel positions in that view.
 

@@ -46,9 +46,6 @@ def match_regions(
     default (see `MatchConfig.method`), which also leaves regions that fit no instance unmatched (-1).
 
     Args:
-        regions: D regions in V views.
-        cameras: V >= 2 cameras.
-        config: method and options.
         residual_px: the reprojection error, one of 1, 2, 4 and 8 pixels, where an earlier matching of these views has
             found it (`MatchReport.residual_px`); None: it is estimated. Only "nview" makes use of it.
         links: regions that show one instance, or different ones; these ids hold, and links that the views agree with
@@ -105,11 +102,8 @@ def match_masks(
 
     Args:
         masks: D masks; their ids are forgotten.
-        cameras: V cameras.
-        config: method and options.
         links: of their rows; those between masks of different classes have no effect.
         num_instances: {class: number of instances}, where an earlier matching has found it; "symnmf" only.
-        residual_px: see `match_regions`.
 
     Returns:
         The matching; instances of different classes have different ids. Its method is that of the config where it is

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 class EpipolarNumbers:
     """Epipolar lines of masks. A third more or less of any limit changes no id on degraded masks of 8 to 16 leaves."""
 
-    line_px: float = 2.0  # thickness of an epipolar line (Sec. 3.1)
-    bins_per_pixel: int = 2  # angular bins: half a pixel wide, so that a line of two pixels is resolved
+    line_px: float = 2.0  # definition: thickness of an epipolar line (Sec. 3.1)
+    bins_per_pixel: int = 2  # insensitive: angular bins: half a pixel wide, so that a line of two pixels is resolved
     min_bins: int = 64  # limit: angular bins of a pencil, at least
-    max_bins: int = 8192  # and at most
+    max_bins: int = 8192  # limit: the same, at most
     pitch_pixels: int = 1024  # limit: pixels of a view that tell how thick a line is, at least about
     run_px: int = 16  # limit: length of a run along a row of a mask, at most: epipolar angles change evenly on it
     wide: float = 0.25  # limit, radians: change of angle along a run from which its pixels count one by one
@@ -32,8 +32,8 @@ class OnePerViewNumbers:
     No id of "nview" changes.
     """
 
-    stop: float = 0.2  # mean weight at which two clusters are still joined: -0.015, +0.031
-    alone: float = 0.1  # summed weight over V - 1, below which everywhere a region stays alone: +0.009, +0.033
+    stop: float = 0.2  # chosen: mean weight at which two clusters are still joined: -0.015, +0.031
+    alone: float = 0.1  # chosen: summed weight over V - 1, below which everywhere a region stays alone: +0.009, +0.033
     max_sweeps: int = 20  # limit: sweeps over the views; nearly always, nothing changes any more before
     tie: float = 1e-9  # limit: difference that is made between equal weights, less than float32 weights can differ by
     forbidden: float = 1e9  # limit: distance between regions of one view; a mean that includes it is never small enough
@@ -44,14 +44,14 @@ class SymnmfNumbers:
     """The paper's clustering."""
 
     ks_at_once: int = 8  # limit: numbers of clusters that are factorised together
-    damping: float = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
+    damping: float = 0.5  # definition: beta of the multiplicative update, as in the paper's SymNMF implementation
 
 
 @dataclass(frozen=True)
 class SweepNumbers:
     """Hypotheses of the plane sweep. A third more or less changes at most one id on masks of 8 and 16 leaves."""
 
-    max_empty: float = 0.5  # views of a hypothesis that show no region, of those its point lies in, at most: -0.005, 0
+    max_empty: float = 0.5  # insensitive: views of a hypothesis without a region, of those that see it: -0.005, 0
     rays: int = 24  # limit: rays per region, at most: +0.001, +0.007
     plenty: int = 10  # limit: views up to which all these rays are cast; with more, each ray shows more
     depths: int = 96  # limit: depths along a ray: -0.034, -0.019
@@ -68,10 +68,11 @@ class EMNumbers:
     Without the second start, degraded masks of 32 leaves in 5 and 8 views lose up to 0.03 of ARI on two plants of six.
     """
 
-    sharpness: tuple[float, ...] = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum, one per iteration
-    empty_cost: float = 0.7  # cost of a hypothesis in which all views show no region
-    starts: tuple[tuple[int, float], ...] = ((-1, 0.3), (1, 0.1))  # iteration to cluster, and where linkage stops
-    many_views: int = 8  # views up to which there is a second start
+    sharpness: tuple[float, ...] = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # chosen: of the soft maximum, one per iteration
+    empty_cost: float = 0.7  # chosen: cost of a hypothesis in which all views show no region
+    # chosen: iteration to cluster, and where linkage stops
+    starts: tuple[tuple[int, float], ...] = ((-1, 0.3), (1, 0.1))
+    many_views: int = 8  # chosen: views up to which there is a second start
     pixels: int = 12  # limit: pixels per region, at most
     views: int = 30  # limit: views of a hypothesis that are compared with each other, at most
     negligible: float = 1e-5  # limit: belief up to which a hypothesis is left out
@@ -86,18 +87,18 @@ class CostNumbers:
     and no id of 8 leaves in 10 and 20 views and of 16 in 3.
     """
 
-    missing: float = 0.7  # cost of no region there, although the cluster has one in this view
-    absent: float = 0.3  # cost of no region there when the cluster has none in this view: its mask may be missed
-    hidden: float = 0.15  # cost of a region of another cluster there, at most; also the most a pixel can cost: 0.05
+    missing: float = 0.7  # chosen: cost of no region there, although the cluster has one in this view
+    absent: float = 0.3  # chosen: cost of no region where the cluster has none in this view: it may be missed
+    hidden: float = 0.15  # chosen: cost of another cluster's region, and the most a pixel can cost: 0.05
 
 
 @dataclass(frozen=True)
 class GainNumbers:
     """What a region gains from a cluster in addition to its score there; one that stays alone gains nothing."""
 
-    coverage: float = 0.5  # gain of a region that all best hypotheses of the cluster show: 0.02
-    weight: float = 1 / 3  # gain per unit of epipolar evidence for a pair of regions, over V - 1: 0.01
-    prior: float = 2.5  # minus the log-odds from which a pair counts for one instance: -0.002, +0.008
+    coverage: float = 0.5  # chosen: gain of a region that all best hypotheses of the cluster show: 0.02
+    weight: float = 1 / 3  # insensitive: gain per unit of epipolar evidence for a pair of regions, over V - 1: 0.01
+    prior: float = 2.5  # insensitive: minus the log-odds from which a pair counts for one instance: -0.002, +0.008
 
     def pair_factor(self, num_views: int) -> float:
         """Gain per unit of epipolar evidence for a pair: 1 / (V - 1) more with few views, that have little other."""
@@ -109,15 +110,15 @@ class GainNumbers:
 class PieceNumbers:
     """When a mask shows a part of an instance, or two of them: segmenters split leaves, and merge them."""
 
-    covered: float = 0.05  # share of a second region in a view that its cluster covers, at least
-    as_good: float = 0.5  # score from which a cluster explains a region or pixel, as a share of its own regions' scores
-    few: float = 0.25  # share of the views up to which a cluster that they show is doubted
-    few_covered: float = 0.02  # share of a doubted cluster's region from which another that covers it takes it over
-    merged_coverage: float = 0.25  # share of another cluster's region from which one that covers it may share it
+    covered: float = 0.05  # chosen: share of a second region in a view that its cluster covers, at least
+    as_good: float = 0.5  # chosen: score from which a cluster explains a region, relative to its own ones
+    few: float = 0.25  # chosen: share of the views up to which a cluster that they show is doubted
+    few_covered: float = 0.02  # chosen: share of a doubted cluster's region for another cluster to take it over
+    merged_coverage: float = 0.25  # chosen: share of another cluster's region from which one may share it
     merged_share: float = 0.2  # definition: share of a mask's pixels that each of its two instances explains, at least
-    neighbours: int = 3  # sampled pixels, the nearest, that decide where a merged mask is cut: no id changes
+    neighbours: int = 3  # insensitive: nearest sampled pixels that decide where a merged mask is cut: no id
     # A higher one, and ids of degraded masks lose more than strangers go.
-    least: float = 0.3  # probability of being a piece below which a mask leaves its cluster: -0.005, +0.010
+    least: float = 0.3  # insensitive: probability of being a piece below which a mask leaves: -0.005, +0.010
 
 
 @dataclass(frozen=True)
@@ -126,9 +127,9 @@ class SearchNumbers:
 
     max_sweeps: int = 3  # limit: sweeps; one more or less changes no id on degraded masks of 8 to 32 leaves
     # At 1, pairwise clusters are never kept, and no id of degraded masks changes; at 0.74, pair F1 loses 0.20.
-    as_good: float = 0.99  # value of pairwise clusters from which they are kept, as a share of the best value
+    as_good: float = 0.99  # chosen: value of pairwise clusters from which they are kept, as a share of the best value
     slack: float = 1e-4  # limit: rounding of a score that is only to be bounded
-    second_chance: float = 0.4  # mean epipolar weight from which a region left alone joins a cluster: no id, one id
+    second_chance: float = 0.4  # insensitive: mean weight from which a lone region joins a cluster: no id, one id
 
 
 @dataclass(frozen=True)
@@ -138,9 +139,9 @@ class NViewNumbers:
     dilations: tuple[int, ...] = (1, 2, 4, 8)  # definition: the reprojection errors that are tried, pixels
     probe_rays: int = 1500  # limit: rays that tell whether a dilation helps, at least about
     # A third more only tries dilations more often.
-    explained: float = 0.5  # mean score of clusters from the weights alone, from which no dilation is tried: -0.022, 0
+    explained: float = 0.5  # chosen: mean score of clusters by weights from which no dilation is tried: -0.022, 0
     # Poses are far off where it is less. A third more or less changes nothing where they are exact, or off by 2 pixels.
-    unexplained: float = 0.3  # the same, below which these clusters are the answer
+    unexplained: float = 0.3  # insensitive: the same, below which these clusters are the answer
 
 
 @dataclass(frozen=True)
@@ -151,8 +152,8 @@ class DoubtNumbers:
     (`benchmarks/confidence.py`).
     """
 
-    trusted: float = 0.75  # mean match score from which ids are taken for right
-    alike: float = 0.7  # what an odd view explains, as a share of what the median view explains, at most
+    trusted: float = 0.75  # chosen: mean match score from which ids are taken for right
+    alike: float = 0.7  # chosen: what an odd view explains, as a share of what the median view explains, at most
     min_views: int = 4  # limit: views from which one of them can be told to be odd
 
 

@@ -26,9 +26,6 @@ def one_per_view_clusters(graph: ViewGraph) -> Clusters:
 
     Average linkage, then sweeps of one assignment problem per view until nothing changes.
 
-    Args:
-        graph: of D regions.
-
     Returns:
         The clusters, those of one region included. They do not depend on the order of views and regions unless weights
         tie.
@@ -44,7 +41,6 @@ def link_average(graph: ViewGraph, stop: float) -> Clusters:
     not show.
 
     Args:
-        graph: of D regions.
         stop: two clusters with a smaller mean weight, or with mean weight 0, are not joined.
 
     Returns:

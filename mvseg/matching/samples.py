@@ -59,9 +59,6 @@ class Samples:
 def view_samples(regions: Regions) -> tuple[list[Samples], list[Tensor]]:
     """The pixels of the regions, view by view.
 
-    Args:
-        regions: D regions in V views.
-
     Returns:
         V `Samples`, and V int64 tensors: the index in `regions` of each region of the view, in the order of `owner`.
     """

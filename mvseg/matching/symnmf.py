@@ -51,13 +51,11 @@ def cluster_affinity(
     """Cluster the graph with SymNMF; without `num_instances`, |k| is the one with the least Eq. 7 in a range.
 
     Args:
-        affinity: the graph of D regions.
         num_per_view: (V,) int64, regions in each view; sets the default range.
         num_instances: k, if known (>= 1).
         search_range: smallest and largest k to try, both included; None for [max_v n_v, 2 max_v n_v]. The smallest k
             wins a tie.
         num_restarts: random starts per factorisation; the best objective wins.
-        seed: for the starts.
 
     Returns:
         The clustering. Regions without an edge are -1 (the paper does not say; an arg max over a row of zeros would put

@@ -79,7 +79,6 @@ def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant
     Where the views choose, and a person speaks of such leaves only, nothing is matched, and what matching said stays.
 
     Args:
-        plant: before the edits.
         corrected: D masks and their links.
         seen: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
 

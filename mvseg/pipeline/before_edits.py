@@ -25,7 +25,7 @@ from mvseg.regions import Regions
 from mvseg.results.result import Instances
 from mvseg.verification.choose import LeftOut
 
-MOST_BYTES = 1 << 29  # of the file, inflated (a technical limit): a stranger's file must not fill the memory
+MOST_BYTES = 1 << 29  # limit: of the file, inflated: a stranger's file must not fill the memory
 FIELDS = ("matching", "instances", "proposals", "matched", "image_size", "boxes", "left", "agreement", "disagreement")
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [

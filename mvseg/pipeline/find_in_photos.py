@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -27,11 +28,7 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     """Look for leaves in the photos; the views choose leaves and masks.
 
     The detector looks at several sizes, unless one is given: see `choose_size`. With twice as many photos as
-    `DETECTION.judging_views`, or more, so many of them choose the size.
-
-    Args:
-        opened: the scene.
-        cache: of the detections.
+    `DETECTION.judging_views`, or more, so many of them choose the size, or the two between which all photos choose.
 
     Raises:
         InputError: see `detect_scene`.
@@ -48,13 +45,26 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
 
     found = choose_size(see, first)
     if few is opened:
-        return know(opened, found)
+        return know(opened, found[0])
     if boxes is not None:
         masks, cameras = first.looks[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
-    size = None if found is first else found.looks[0].longest
-    return know(opened, look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes))
+    sizes = [None if each is first else each.looks[0].longest for each in found]
+    return know(opened, _look_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
+
+
+def _look_in_all(
+    opened: Opened,
+    sizes: Sequence[int | None],
+    detect: DetectConfig,
+    *,
+    cache: CachedDetections | None,
+    boxes: Tensor | None,
+) -> Found:
+    """What all views find at that one of the sizes where their agreed area is largest; None is the detector's own."""
+    seen = [look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
+    return max(seen, key=lambda each: each.agreed_area)
 
 
 def _thin(opened: Opened) -> tuple[Opened, Tensor]:
@@ -80,8 +90,8 @@ def look_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | N
 
     found = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
-        return found
-    return look_once(opened, replace(detect, image_size=found.looks[0].longest), cache=cache, boxes=boxes)
+        return found[0]
+    return _look_in_all(opened, [each.looks[0].longest for each in found], detect, cache=cache, boxes=boxes)
 
 
 def look_once(
@@ -94,10 +104,7 @@ def look_once(
     """What one look finds, with its warnings in it: it may be thrown away.
 
     Args:
-        opened: the scene.
         detect: which detector, and at which size.
-        cache: of the detections.
-        boxes: see `detect_scene`.
     """
     with collect_warnings() as said:
         look = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)

@@ -52,7 +52,6 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
     Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted by a later one.
 
     Args:
-        plant: the masks.
         same_segmenter: the surfaces before edits, see `fit_surfaces`; None: there are no edits.
     """
     opened, num_moved = plant.opened, None

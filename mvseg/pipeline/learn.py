@@ -36,9 +36,9 @@ from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
 from mvseg.verification.unexplained import is_familiar
 
-ROUNDS = 3  # where nobody says how many; most plants gain nothing from the third one (docs/detector.md)
-# Growth of the agreed area from which new weights stay. Where MV-PQ gained 0.04 or more, it grew by 1.13 to 1.23, and
-# by 1.08 where nothing was gained (docs/notes/detector.md).
+ROUNDS = 3  # limit: where nobody says how many; most plants gain nothing from the third one (docs/detector.md)
+# chosen: growth of the agreed area from which new weights stay. Where MV-PQ gained 0.04 or more, it grew by 1.13 to
+# 1.23, and by 1.08 where nothing was gained (docs/notes/detector.md).
 GROWTH = 1.1
 
 

@@ -39,9 +39,7 @@ def run_scene(
     """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
 
     Args:
-        folder: the scene, see `load_scene`.
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
-        config: the options of all stages.
         corrections: of a person, or the file of them, see `load_corrections`; without any edits they change nothing.
         force_corrections: apply them even if they were made for other photos.
         cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on

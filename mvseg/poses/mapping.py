@@ -67,9 +67,7 @@ def find_structure(
     fixed seeds, and the mapping runs on one thread. Other processors round differently.
 
     Args:
-        images: folder of the photos.
         photos: in the order in which they were taken.
-        config: see `PoseConfig`.
         calibration: camera of all photos, which then stays as it is.
         work: folder on whose disk COLMAP keeps its database meanwhile (default: the system's for temporary files).
 

@@ -27,8 +27,8 @@ from mvseg.formats.opencv_yaml import Calibration
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.system.running import progress_bar
 
-FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM = 0x920A, 0xA405, 0xA404  # EXIF tags
-CAMERA_MODEL, EXIF_BLOCK = 0x0110, 0x8769
+FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM = 0x920A, 0xA405, 0xA404  # definition: EXIF tags
+CAMERA_MODEL, EXIF_BLOCK = 0x0110, 0x8769  # definition: EXIF tags
 
 
 @dataclass(frozen=True)

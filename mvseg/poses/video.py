@@ -51,7 +51,6 @@ def write_frames(clip: Path, folder: Path, *, most: int) -> list[str]:
     """Write the sharp frames of a video into a new folder as JPEG, upright; returns their names, in order of time.
 
     Args:
-        clip: the video.
         folder: made here.
         most: number of frames, at most; a video with less motion gives fewer.
 

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 class RayNumbers:
     """Directions of cameras, and points where rays meet."""
 
-    most_error: float = 0.003  # miss of a point in a view, in widths of the photo, from which it is left out: it moved
-    least_angle: float = math.radians(1.0)  # angle between two rays that make a point, at least
+    most_error: float = 0.003  # chosen: miss of a point, in widths of the photo, from which a view is left out
+    least_angle: float = math.radians(1.0)  # chosen: angle between two rays that make a point, at least
     same: float = math.radians(1.0)  # limit: angle between directions below which they crowd each other no more
-    parallel: float = math.radians(2.0)  # root mean square of axes' angles to their mean, where they meet in no point
+    parallel: float = math.radians(2.0)  # chosen: RMS of axes' angles to their mean, where they meet in no point
     tie: float = 1e-6  # limit: difference of equal sums, as a share; the first one is taken
 
 
@@ -28,7 +28,7 @@ class VoxelNumbers:
     search_cells: int = 24  # limit: cells along the box of an instance, at which the search for it ends
     max_cells: int = 100_000  # limit: cells in all, at which it ends
     max_voxels: int = 200_000_000  # limit: voxels of a grid
-    crumb: float = 0.02  # size of a piece below which it is a crumb, as a share of the largest piece's voxels
+    crumb: float = 0.02  # chosen: size of a piece below which it is a crumb, as a share of the largest piece's voxels
     at_once: int = 8_000_000  # limit: balls and masks that are compared at once
 
 
@@ -36,9 +36,9 @@ class VoxelNumbers:
 class HullNumbers:
     """The hull of a leaf, from which starts are made."""
 
-    shown_share: float = 0.5  # share of the masks above which a voxel that is in them is occupied
-    seen_share: float = 0.8  # min. fraction of unoccluded views that contain a voxel; below it, the voxel is removed
-    cell_px: float = 6.0  # side of a cell in the photos, below which the search ends
+    shown_share: float = 0.5  # chosen: share of the masks above which a voxel that is in them is occupied
+    seen_share: float = 0.8  # chosen: min. fraction of unoccluded views that contain a voxel; else it is removed
+    cell_px: float = 6.0  # limit: side of a cell in the photos, below which the search ends
     most_cells: int = 10_000  # limit: cells, at which it ends
     num_voxels: int = 20_000  # limit: voxels that are looked at in these cells, about
 
@@ -47,9 +47,9 @@ class HullNumbers:
 class StackNumbers:
     """Masks of a leaf as they are compared."""
 
-    blur_px: float = 0.8  # Gaussian that blurs masks, so that their edges are smooth functions of the position
+    blur_px: float = 0.8  # chosen: Gaussian that blurs masks, so that their edges are smooth functions of the position
     margin: int = 24  # limit: pixels of a crop around its mask
-    large_px: float = 60.0  # root of the median area of masks that are not made smaller
+    large_px: float = 60.0  # limit: root of the median area of masks that are not made smaller
     long_px: int = 400  # limit: longest side of a mask that is not made smaller
     edge_samples: int = 40  # limit: samples of the edge of a mask, about
 
@@ -59,29 +59,29 @@ class StartNumbers:
     """Rough patches to start a fit from, and the axes that they are given in."""
 
     most_points: int = 1000  # limit: voxels that are used; enough for nine windows
-    num_windows: int = 9  # windows along the leaf, whose middles the midrib of a start goes through
-    neighbours: int = 8  # others that a voxel is joined to, where the way along a leaf is looked for
-    elongated: float = 2.0  # ratio of the two largest deviations of a leaf, from which its axis may be a curve
-    bent: float = 1.35  # or of the way along it to the straight one: graphs make detours of a tenth
-    turns_deg: tuple[float, ...] = (0.0, 90.0, 45.0, 135.0)  # angles about the midrib at which starts have their side
+    num_windows: int = 9  # limit: windows along the leaf, whose middles the midrib of a start goes through
+    neighbours: int = 8  # limit: others that a voxel is joined to, where the way along a leaf is looked for
+    elongated: float = 2.0  # chosen: ratio of the two largest deviations of a leaf, from which its axis may be a curve
+    bent: float = 1.35  # chosen: or of the way along it to the straight one: graphs make detours of a tenth
+    turns_deg: tuple[float, ...] = (0.0, 90.0, 45.0, 135.0)  # chosen: angles about the midrib of the starts' sides
     # Masks of a pixel have flat hulls, or hulls of a few voxels.
-    thinnest: float = 0.01  # width of a start in its lengths, and length in deviations of the cloud, at least
+    thinnest: float = 0.01  # limit: width of a start in its lengths, and length in deviations of the cloud, at least
     tie: float = 1e-6  # limit: difference of equal lengths or distances, by rounding; the first one is taken
-    flat: float = 1e-3  # part of a direction out of the plane of the cameras up to which they lie in one with the leaf
+    flat: float = 1e-3  # chosen: part of a direction out of the cameras' plane, up to which a leaf lies in it
 
 
 @dataclass(frozen=True)
 class PriorNumbers:
     """Standard deviations of what should be none: bend, sway and speed in leaf lengths, the rest in half-widths."""
 
-    bend_sd: float = 0.06  # third differences of m
-    sway_sd: float = 0.1  # times length / width: turns of the midrib within the blade, from each piece to the next
-    speed_sd: float = 0.05  # differences of the speed along a piece of the midrib from one length in all
-    side_sd: float = 1.0  # second differences of Q
-    normal_sd: float = 0.35  # R and S along the normal
-    fold_step_sd: float = 0.2  # differences of R
-    shear_sd: float = 0.15  # Q along the midrib, and R and S within the blade
-    num_pieces: int = 10  # pieces of the midrib, for sway and speed
+    bend_sd: float = 0.06  # chosen: third differences of m
+    sway_sd: float = 0.1  # chosen: times length / width: turns of the midrib within the blade, piece to piece
+    speed_sd: float = 0.05  # chosen: differences of the speed along a piece of the midrib from one length in all
+    side_sd: float = 1.0  # chosen: second differences of Q
+    normal_sd: float = 0.35  # chosen: R and S along the normal
+    fold_step_sd: float = 0.2  # chosen: differences of R
+    shear_sd: float = 0.15  # chosen: Q along the midrib, and R and S within the blade
+    num_pieces: int = 10  # chosen: pieces of the midrib, for sway and speed
 
 
 @dataclass(frozen=True)
@@ -91,28 +91,29 @@ class FitNumbers:
     Covariances were fitted (`python benchmarks/traits.py --cache DIR`, column "inside").
     """
 
-    grid: tuple[int, int] = (36, 9)  # rows and columns of the points at which a patch is fitted, and measured for that
-    far_grid: tuple[int, int] = (20, 5)  # the same where it is still far from the masks
+    grid: tuple[int, int] = (36, 9)  # limit: rows and columns of points at which a patch is fitted and measured
+    far_grid: tuple[int, int] = (20, 5)  # limit: the same where it is still far from the masks
     num_steps: int = 7  # limit: steps from a start that is nearly right
-    far_reach: float = 14.0  # pixels within which a sample looks for an edge, at first
-    near_reach: float = 6.0  # the same in the end
-    far_step: tuple[float, float] = (0.05, 0.25)  # damping of a step, and its longest way in half-widths, at first
-    near_step: tuple[float, float] = (0.005, 0.12)  # the same in the end
-    sample_weight: float = 0.35  # weight of a sample: neighbouring samples are alike
-    far_scale_px: float = 4.0  # distance that has half the weight of none, at first
-    least_scale_px: float = 0.7  # the same in the end, at least
-    scale_factor: float = 4.0  # the same in median distances, at least: masks may contradict each other
-    offset_from: int = 6  # step from which masks may be too large or small
-    offset_share: float = 0.8  # share of what is measured of that which is believed
-    clean_px: float = 1.0  # deviation of distances below which masks are clean; above, fold and curl stay near none
-    narrow: float = 0.15  # width of half a leaf that limits steps, as a share of its length, at least
-    noisy_view: float = 1.5  # deviation of a view's distances from which it counts less, in the usual one
-    sd_factor: float = 2.0  # factor of deviations
+    far_reach: float = 14.0  # chosen: pixels within which a sample looks for an edge, at first
+    near_reach: float = 6.0  # chosen: the same in the end
+    # chosen: damping of a step, and its longest way in half-widths, at first
+    far_step: tuple[float, float] = (0.05, 0.25)
+    near_step: tuple[float, float] = (0.005, 0.12)  # chosen: the same in the end
+    sample_weight: float = 0.35  # chosen: weight of a sample: neighbouring samples are alike
+    far_scale_px: float = 4.0  # chosen: distance that has half the weight of none, at first
+    least_scale_px: float = 0.7  # chosen: the same in the end, at least
+    scale_factor: float = 4.0  # chosen: the same in median distances, at least: masks may contradict each other
+    offset_from: int = 6  # chosen: step from which masks may be too large or small
+    offset_share: float = 0.8  # chosen: share of what is measured of that which is believed
+    clean_px: float = 1.0  # chosen: deviation of distances of clean masks; above, fold and curl stay near none
+    narrow: float = 0.15  # chosen: width of half a leaf that limits steps, as a share of its length, at least
+    noisy_view: float = 1.5  # chosen: deviation of a view's distances from which it counts less, in the usual one
+    sd_factor: float = 2.0  # chosen: factor of deviations
     difference: float = 1e-4  # limit: move of a coefficient for a derivative, as a share of the spread of all
-    quiet_px: float = 0.3  # root mean square distance above which the factor is larger
+    quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     # Where masks are clean, little is measured.
-    centre_factor: float = 1.5  # deviation of what all masks may be too large by, in the measured one
-    least_centre_sd: float = 0.1  # the same in pixels, at least
+    centre_factor: float = 1.5  # chosen: deviation of what all masks may be too large by, in the measured one
+    least_centre_sd: float = 0.1  # chosen: the same in pixels, at least
     # Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15.
     least_eigenvalue: float = 1e-10  # limit: least eigenvalue of a scaled normal matrix that is not singular
 
@@ -122,25 +123,25 @@ class ImageNumbers:
     """A patch drawn as masks are."""
 
     supersampled: int = 3  # limit: small pixels along each side of a pixel that is drawn
-    drawn_too_far: float = 0.48  # small pixels by which OpenCV draws polygons too wide on every side (test_outline.py)
+    drawn_too_far: float = 0.48  # definition: pixels by which OpenCV widens polygons (test_outline.py)
     sub_pixel_bits: int = 4  # limit: corners of OpenCV's polygons are whole numbers of 1 / 2^4 pixels
-    least_growth_px: float = 0.15  # offset with which a patch is drawn, at least: less is not worth the time
-    drawn_beside: int = 4  # pixels that the blurred image of a patch reaches beyond it
-    near_px: int = 6  # distance from a leaf in which it matters what lies in front
+    least_growth_px: float = 0.15  # limit: offset with which a patch is drawn, at least: less is not worth the time
+    drawn_beside: int = 4  # limit: pixels that the blurred image of a patch reaches beyond it
+    near_px: int = 6  # chosen: distance from a leaf in which it matters what lies in front
 
 
 @dataclass(frozen=True)
 class OutlineNumbers:
     """Outlines of a patch and edges of masks."""
 
-    beyond_px: tuple[float, ...] = (1.0, 2.0)  # distances from an edge at which another instance begins beyond it
+    beyond_px: tuple[float, ...] = (1.0, 2.0)  # chosen: distances from an edge at which another instance begins
     # Filled quads are half a pixel too wide.
-    outside_px: float = 1.6  # distance from a sample on the outline of a pixel that the patch does not cover
-    reverse_weight: float = 0.5  # weight of samples of the masks' edges, where that of the patch's is 1
-    pull_from_px: float = 4.0  # distance outside of the patch from which an edge pulls at its nearest sample
-    similar: float = 0.5  # cosine between the normals of two samples that match, at least
+    outside_px: float = 1.6  # chosen: distance from a sample on the outline of a pixel that the patch does not cover
+    reverse_weight: float = 0.5  # chosen: weight of samples of the masks' edges, where that of the patch's is 1
+    pull_from_px: float = 4.0  # chosen: distance outside of the patch from which an edge pulls at its nearest sample
+    similar: float = 0.5  # chosen: cosine between the normals of two samples that match, at least
     near_steps: int = 3  # limit: steps of a pixel to either side where an edge is looked for first: most are there
-    most_shift_px: float = 5.0  # distance between the outline of a patch and the edge of its image, at most
+    most_shift_px: float = 5.0  # chosen: distance between the outline of a patch and the edge of its image, at most
 
 
 @dataclass(frozen=True)
@@ -148,40 +149,40 @@ class SearchNumbers:
     """The search for the best fit of each leaf."""
 
     first_steps: int = 3  # limit: steps of the fit before the second one
-    most_views: int = 20  # views of an instance that a fit looks at, at most: more add time, and next to nothing else
+    most_views: int = 20  # limit: views of an instance that a fit looks at; more only add time
     few_masks: int = 60  # limit: masks below which they are fitted in this process: others would take longer to start
     at_once: int = 8  # limit: instances whose starts are searched side by side
     searched_views: int = 12  # limit: views of a leaf in which starts are compared, evenly spread
-    most_starts: int = 3  # starts of each hull that are tried, at most
+    most_starts: int = 3  # limit: starts of each hull that are tried, at most
     most_fits: int = 3  # limit: starts that are fitted, but for rough fits
-    clear_iou: float = 0.75  # median IoU of the likely start, before any fit, from which a rough fit tries no other one
-    least_gain: float = 0.03  # IoU by which another start must be better, for a rough fit to take it
-    good_iou: float = 0.93  # median IoU of a patch above which the second hull is not asked
-    forgiven: float = 0.5  # share of IoU given back where all masks are too large or small: faulty masks reach less
-    as_good: float = 0.03  # IoU below the best one down to which fits are as good, the less the more they lack
-    area_cost: float = 0.1  # IoU that a surface e times as large loses: bulges can hide behind outlines of a level leaf
-    wide_cost: float = 0.1  # IoU that a patch wider than long loses: some would run from edge to edge
-    hopeless: float = 0.1  # IoU below the best one from which a patch goes no farther than half way
-    wrong_share: float = 0.25  # share of the hull in a mask, of the median one, below which it is another leaf's
-    behind: float = 0.03  # distance of a neighbour that lies behind, as a share of the leaf's length
+    clear_iou: float = 0.75  # chosen: median IoU of the likely start from which a rough fit tries no other one
+    least_gain: float = 0.03  # chosen: IoU by which another start must be better, for a rough fit to take it
+    good_iou: float = 0.93  # chosen: median IoU of a patch above which the second hull is not asked
+    forgiven: float = 0.5  # chosen: share of IoU given back where all masks are too large or too small
+    as_good: float = 0.03  # chosen: IoU below the best one down to which fits are as good, the less the more they lack
+    area_cost: float = 0.1  # chosen: IoU that a surface e times as large loses: bulges hide behind outlines
+    wide_cost: float = 0.1  # chosen: IoU that a patch wider than long loses: some would run from edge to edge
+    hopeless: float = 0.1  # chosen: IoU below the best one from which a patch goes no farther than half way
+    wrong_share: float = 0.25  # chosen: share of the hull in a mask, relative to the median one, of another leaf
+    behind: float = 0.03  # chosen: distance of a neighbour that lies behind, as a share of the leaf's length
 
 
 @dataclass(frozen=True)
 class DoubtNumbers:
     """When a surface is doubted."""
 
-    least_iou: float = 0.8  # median IoU below which it is
-    credible_iou: float = 0.7  # median IoU from which its measures are given at all: buds, fruit and stems have less
-    most_area_share: float = 0.1  # deviation of its area, as a share of it, above which it is
+    least_iou: float = 0.8  # chosen: median IoU below which it is
+    credible_iou: float = 0.7  # chosen: median IoU from which measures are given; buds, fruit and stems have less
+    most_area_share: float = 0.1  # chosen: deviation of its area, as a share of it, above which it is
     # A deep cup that most views look into shows in one view what it is; ovate leaves lack 0.02 at most.
-    clean_iou: float = 0.95  # median IoU above which it is doubted if it lacks too much of a single mask
-    most_lacking: float = 0.05  # what that is, as a share of the median mask
+    clean_iou: float = 0.95  # chosen: median IoU above which it is doubted if it lacks too much of a single mask
+    most_lacking: float = 0.05  # chosen: what that is, as a share of the median mask
     # A patch fills the bays of a star: 2.5 % of it lie there, of leaves, hearts and rectangles 0.5 % at most.
-    shown: float = 0.2  # share of the masks that show a part, below which it is not shown
-    most_unshown: float = 0.02  # share of its area that is not shown, above which it is doubted
+    shown: float = 0.2  # chosen: share of the masks that show a part, below which it is not shown
+    most_unshown: float = 0.02  # chosen: share of its area that is not shown, above which it is doubted
     # The midrib ends in a corner: rectangles have 0.9 there, discs and hearts 0.4, leaves 0.3.
-    near_end: float = 0.02  # distance from an end where its width is measured, as a share of its length
-    blunt: float = 0.7  # width there, as a share of the greatest, above which it is doubted
+    near_end: float = 0.02  # chosen: distance from an end where its width is measured, as a share of its length
+    blunt: float = 0.7  # chosen: width there, as a share of the greatest, above which it is doubted
 
 
 @dataclass(frozen=True)
@@ -189,19 +190,19 @@ class ErrorNumbers:
     """How the masks of a segmenter err."""
 
     rounds: int = 4  # limit: times that the offsets and their density are found in turn
-    least_masks: int = 20  # masks from which errors are learnt, at least
-    least_spread_px: float = 0.3  # deviation of their sizes below which they are clean
-    measured_px: float = 0.2  # standard deviation of the measured offset of one mask
+    least_masks: int = 20  # limit: masks from which errors are learnt, at least
+    least_spread_px: float = 0.3  # chosen: deviation of their sizes below which they are clean
+    measured_px: float = 0.2  # chosen: standard deviation of the measured offset of one mask
     step_px: float = 0.05  # limit: steps at which a density is given
-    floor: float = 1e-3  # density per pixel, at least: any mask may be wrong in another way
+    floor: float = 1e-3  # limit: density per pixel, at least: any mask may be wrong in another way
 
 
 @dataclass(frozen=True)
 class StemNumbers:
     """Which end of a leaf is its base."""
 
-    least_leaves: int = 4  # leaves from which the stem is looked for
-    clear: float = 0.25  # share of the length by which the base is nearer to the stem than the tip, to be sure
+    least_leaves: int = 4  # limit: leaves from which the stem is looked for
+    clear: float = 0.25  # chosen: share of the length by which the base is nearer to the stem than the tip, to be sure
     rounds: int = 5  # limit: rounds of fitting the stem to the bases
 
 

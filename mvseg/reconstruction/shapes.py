@@ -28,10 +28,7 @@ def reconstruct_voxels(
     """Voxels of the instances that need them, as `config.shape` says.
 
     Args:
-        regions: D regions.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
-        cameras: V cameras.
-        config: what to make, and how.
         surfaces: {instance id: surface}; None: nobody fitted any.
 
     Returns:

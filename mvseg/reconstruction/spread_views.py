@@ -23,7 +23,6 @@ def spread_views(cameras: Cameras, most: int) -> Tensor:
     equally even, and nothing else.
 
     Args:
-        cameras: V cameras.
         most: >= 1; all views are taken where there are no more than that.
 
     Returns:

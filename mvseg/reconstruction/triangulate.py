@@ -20,7 +20,6 @@ def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, 
     """Points that two views or more agree on.
 
     Args:
-        cameras: V cameras.
         seen: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
 
     Returns:

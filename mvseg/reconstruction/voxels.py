@@ -109,10 +109,7 @@ def reconstruct_instances(
     Departs from the paper by `config.seen_share`, which brings shapes closer to the true leaves (docs/benchmarks.md).
 
     Args:
-        regions: D regions.
         instance_ids: (D,) int64, from 1 on; -1 = matched to nothing.
-        cameras: V cameras.
-        config: thresholds and voxel size.
 
     Returns:
         {instance id: grid}, votes on the device of the regions. Instances seen in one view only are left out: they have
@@ -154,7 +151,6 @@ def back_project(
 
     Args:
         members: the masks of the instance.
-        cameras: V cameras.
         config: threshold, voxel size (world units) or voxel budget.
         free: view -> (H, W) bool, where it shows no region of any instance, for `config.seen_share`; of every view
             with a mask. None: no pixel is known to be free, which leaves the paper's rule.

@@ -52,11 +52,8 @@ def save_result(
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
 
     Args:
-        result: the result.
-        out: the folder.
         run: what goes into run.json besides timings and counts: version, config, inputs, warnings; None: what a result
             that was loaded knows of its run.
-        report: write report.html, too.
         output: what may be replaced; by default any result.
 
     Raises:

@@ -11,11 +11,11 @@ import numpy as np
 from mvseg.masks import SURE, Masks
 from mvseg.results.scale_bar import ScaleBar
 
-MAX_SIDE = 1600  # pixels of an overlay's longer side, at most
-MARGIN = 0.06  # margin around the plant in a picture, as a share of its longer side
-LEAST_SHARE = 0.05  # width of a picture as a share of the photo's, at least: a photo has no more detail
-UNMATCHED = (150, 150, 150)
-CAPITAL = 26  # pixels of the height of OpenCV's digits at scale 1
+MAX_SIDE = 1600  # limit: pixels of an overlay's longer side, at most
+MARGIN = 0.06  # limit: margin around the plant in a picture, as a share of its longer side
+LEAST_SHARE = 0.05  # limit: width of a picture as a share of the photo's, at least: a photo has no more detail
+UNMATCHED = (150, 150, 150)  # chosen: RGB of masks without an instance
+CAPITAL = 26  # limit: pixels of the height of OpenCV's digits at scale 1
 
 Box = tuple[int, int, int, int]
 _Number = tuple[str, tuple[int, int], float]  # text, column and row of its middle, radius of the circle that fits there
@@ -38,8 +38,6 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int, bar: ScaleBar | 
 
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
-        masks: D masks.
-        view: index of the view.
         bar: a scale bar for the lower left corner.
 
     Returns:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
 
-MOST_INSTANCES = 65534  # number of instances that a label image of 16 bits can hold
+MOST_INSTANCES = 65534  # definition: number of instances that a label image of 16 bits can hold
 READ_FILES = (
     DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "nodes.csv", "surfaces.npz", "voxels.npz"
 )  # fmt: skip

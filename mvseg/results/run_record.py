@@ -15,7 +15,7 @@ from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
 from mvseg.system.atomic import sweep_abandoned
 
-FORMAT = 2  # of the folder; 1, which says no "format", was of versions before 0.2.0
+FORMAT = 2  # definition: of the folder; 1, which says no "format", was of versions before 0.2.0
 
 
 class _Part(BaseModel):

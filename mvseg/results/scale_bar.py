@@ -15,8 +15,8 @@ if TYPE_CHECKING:
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
 
-STEPS = (1, 2, 5)  # round lengths, times powers of ten
-MOST = 0.2  # length of a bar, as a share of the photo's width, at most
+STEPS = (1, 2, 5)  # definition: round lengths, times powers of ten
+MOST = 0.2  # definition: length of a bar, as a share of the photo's width, at most
 
 
 @dataclass(frozen=True)

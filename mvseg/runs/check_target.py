@@ -34,11 +34,11 @@ from mvseg.traits.leaf import missing
 
 Floats = NDArray[np.float64]
 
-NORMAL_95 = 1.96  # standard deviations
-# Of lengths; 2 % of areas. More is said to be a wrong scale: printers that fit a page shrink it by 3 %, and tags are
-# measured to 0.1 %, so a third more or less changes no verdict about these.
+NORMAL_95 = 1.96  # definition: standard deviations
+# chosen: of lengths; 2 % of areas. More is said to be a wrong scale: printers that fit a page shrink it by 3 %, and
+# tags are measured to 0.1 %, so a third more or less changes no verdict about these.
 MOST_OFF = 0.01
-MOST_OUTSIDE = 1  # of four: two outside of their 95 % intervals are chance in 1.4 % of sound chains
+MOST_OUTSIDE = 1  # chosen: of four: two outside of their 95 % intervals are chance in 1.4 % of sound chains
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,6 @@ def pose_photos(
         photos: folder of photos, with one folder per camera below it or none; or a video, of which sharp frames become
             the photos.
         out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
-        config: how cameras are estimated.
         known: where scale and axes come from.
         up: the direction of up in the known world, or how to find it.
 

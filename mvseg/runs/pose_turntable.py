@@ -46,7 +46,6 @@ def pose_board_photos(
             the same angles in the same order.
         out: the scene folder; an earlier one is replaced, files of the user in it stay.
         board: what is printed; its lengths are in `unit`.
-        unit: name of the unit.
         calibration: file of OpenCV or ROS with the camera matrix and distortion of all cameras, which are then not
             estimated.
 
@@ -107,7 +106,6 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
     Args:
         photos: folder of photos, or of one folder for each camera, named as in the calibration.
         out: the scene folder, as above.
-        turntable: a turntable file.
         angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
             of the file, which then has as many views of each camera as there are photos.
 

@@ -62,7 +62,6 @@ def repeat_run(
     """The request that made a result, once more, with its options; stderr says what has changed since.
 
     Args:
-        folder: the result.
         out: where the new one goes; None: in its place.
         learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: what the run has learned
             before is used.

@@ -19,10 +19,10 @@ from mvseg.errors import InputError
 from mvseg.server.saved_edits import Refused, SavedEdits
 from mvseg.system.running import Cancelled, running
 
-WAIT_SECONDS = 20.0  # that a page's question for news stays open
-LOOK_SECONDS = 1.0  # until it looks again whether another program has changed the edits
-STEP_SECONDS = 1.0  # between two words of what is computed
-LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
+WAIT_SECONDS = 20.0  # limit: that a page's question for news stays open
+LOOK_SECONDS = 1.0  # limit: until it looks again whether another program has changed the edits
+STEP_SECONDS = 1.0  # limit: between two words of what is computed
+LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # chosen: that learning takes on two cores, which the page says before
 
 
 def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:

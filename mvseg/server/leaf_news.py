@@ -40,7 +40,6 @@ def tell_drawn(result: Result, *, new: Sequence[Edit], angles: NDArray[np.int64]
     """A sentence for each leaf of new outlines: in how many other photos it was found, or why it was not.
 
     Args:
-        result: with these edits.
         new: edits, of which outlines count.
         angles: (V, V) degrees between the photos, see `measure_angles`.
     """

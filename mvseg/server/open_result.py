@@ -53,7 +53,7 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 from mvseg.verification.numbers import EVIDENCE
 
-MOST_CORNERS = 10_000
+MOST_CORNERS = 10_000  # limit: corners of an outline that the page sends
 
 
 class _Rough(BaseModel):
@@ -210,9 +210,7 @@ class OpenResult:
         `learned` is what is known then, and None undoes it. Each time begins with the weights of the run.
 
         Args:
-            corrections: of the person.
             is_old: whether nobody wants it any more; asked at every step.
-            report: is told what is done.
 
         Raises:
             Cancelled: `is_old` said so.

@@ -48,7 +48,6 @@ class SavedEdits:
         """Write the edits of a corrections.json.
 
         Args:
-            text: its content.
             base: the `name_edits` of the list that this one was made from.
             mark: what else is written with the edits.
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
-BLADE_COLUMNS = 9  # vertices across a blade; odd, so that the midrib is a grid line
+BLADE_COLUMNS = 9  # limit: vertices across a blade; odd, so that the midrib is a grid line
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ from mvseg.errors import InputError
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import SimulatedPlant
 
-FRAME_FILL = 0.94  # share of the half image that the farthest point of the plant reaches
-DISTANCE = 3.5  # from the cameras to the plant's centre, in radii of the plant
+FRAME_FILL = 0.94  # chosen: share of the half image that the farthest point of the plant reaches
+DISTANCE = 3.5  # chosen: from the cameras to the plant's centre, in radii of the plant
 
 
 def arc_cameras(

@@ -19,10 +19,10 @@ from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_bla
 from mvseg.simulation.families import FAMILIES, Family, draw_blade
 from mvseg.simulation.pot import Part, Pot, draw_pot, lift, make_tube, pot_parts
 
-MAX_LEAVES = 64
+MAX_LEAVES = 64  # limit: leaves of a plant
 GOLDEN_ANGLE = math.radians(137.50776)
-POSES_TRIED = 8  # per frond; the least crowded one is kept, so that blades seldom cut through each other
-CLEARANCE = 6.0  # mm; blades that come closer than this crowd each other
+POSES_TRIED = 8  # limit: per frond; the least crowded one is kept, so that blades seldom cut through each other
+CLEARANCE = 6.0  # chosen: mm; blades that come closer than this crowd each other
 FAR_AWAY = np.array([[0.0, 0.0, -1e6]])  # a point that crowds nothing
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-TEXTURE_SIZE = 256
+TEXTURE_SIZE = 256  # limit: pixels of a texture's side
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,8 @@ import numpy as np
 from mvseg.simulation.blades import Floats, Ints, grid_faces
 from mvseg.simulation.families import Family
 
-TUBE_SIDES = 8
-ROUND = 48  # sides of a round pot
+TUBE_SIDES = 8  # limit: sides of a tube
+ROUND = 48  # limit: sides of a round pot
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,9 +26,9 @@ from mvseg.simulation.shading import GROUND, MATERIALS, Hits, backdrop_color, de
 
 Doubles = NDArray[np.float64]
 
-LIFT_MM = 0.05  # shadow rays start this far off the surface
-SUN_RAYS = 3  # per pixel
-SKY_RAYS = 48  # per vertex, over the full sphere
+LIFT_MM = 0.05  # limit: shadow rays start this far off the surface
+SUN_RAYS = 3  # limit: per pixel
+SKY_RAYS = 48  # limit: per vertex, over the full sphere
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,8 +30,8 @@ from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.system.atomic import folder_whole
 
-JPEG_QUALITY = 90
-MIN_PIXELS = 30  # a leaf with fewer visible pixels in a view is left out of that view's masks and truth
+JPEG_QUALITY = 90  # chosen: of photos
+MIN_PIXELS = 30  # limit: a leaf with fewer visible pixels in a view is left out of that view's masks and truth
 
 
 def write_scene(folder: Path | str, plant: SimulatedPlant, cameras: Cameras, *, seed: int) -> None:

@@ -41,11 +41,11 @@ from mvseg.simulation.wild import hang, roll_up
 from mvseg.system.atomic import folder_whole
 
 SERIES_FILE, TRUTH_FILE = "series.csv", "truth.csv"
-NUM_DATES = 8  # of the specs that are drawn
-EXPANSION = 14.0  # days from a leaf's first sight to its full size
-FIRST_SIZE = 0.15  # share of its full length at which a leaf is first seen
-YELLOWING = 6.0  # days from the first yellow to the fall
-WILT = 24.0  # degrees that petioles sink by, and blades bend more, on a date of wilting
+NUM_DATES = 8  # chosen: of the specs that are drawn
+EXPANSION = 14.0  # chosen: days from a leaf's first sight to its full size
+FIRST_SIZE = 0.15  # chosen: share of its full length at which a leaf is first seen
+YELLOWING = 6.0  # chosen: days from the first yellow to the fall
+WILT = 24.0  # chosen: degrees that petioles sink by, and blades bend more, on a date of wilting
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mvseg.simulation.look import Floats, Look
 
 MATERIALS = ("leaf", "stem", "pot", "soil", "ground", "stake")
-LEAF, SOIL, GROUND = 0, 3, 4
+LEAF, SOIL, GROUND = 0, 3, 4  # definition: kinds of surfaces
 VEIN_TINT = np.array([0.8, 0.5, 0.6], np.float32)
 SICK = np.array([0.20, 0.13, 0.05], np.float32)
 YELLOW = np.array([0.33, 0.26, 0.04], np.float32)

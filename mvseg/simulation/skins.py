@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from mvseg.errors import InputError
 from mvseg.simulation.look import Floats, Look, Marking, hue_color
 
-ROWS, COLUMNS = 192, 65  # texels of a skin along and across the leaf
-GAMMA = 2.2  # of the photos that skins are cut from
+ROWS, COLUMNS = 192, 65  # limit: texels of a skin along and across the leaf
+GAMMA = 2.2  # definition: of the photos that skins are cut from
 
 
 def list_skins(folder: Path | None) -> tuple[Floats, ...]:

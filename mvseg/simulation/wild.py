@@ -17,8 +17,8 @@ from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.pot import Part, make_tube
 
-MOST_LEAVES_WITH_COTYLEDONS = 12  # older plants have shed them
-SOIL_CLEARANCE = 2.0  # mm; leaves hang down no further
+MOST_LEAVES_WITH_COTYLEDONS = 12  # chosen: older plants have shed them
+SOIL_CLEARANCE = 2.0  # chosen: mm; leaves hang down no further
 
 
 def make_wild(plant: SimulatedPlant, seed: int) -> SimulatedPlant:

@@ -51,7 +51,7 @@ class Cancelled(Exception):
 
 
 NETWORKS = "detect", "learn"  # definition: stages that networks work in
-LINE_SECONDS = 60.0  # between two lines of one stage
+LINE_SECONDS = 60.0  # limit: between two lines of one stage
 SILENT = Running()
 _NOW: ContextVar[Running] = ContextVar("mvseg_running")
 

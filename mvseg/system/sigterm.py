@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-AGAIN = 0.05  # seconds
+AGAIN = 0.05  # limit: seconds
 
 
 class Terminated(BaseException):

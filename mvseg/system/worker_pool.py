@@ -25,7 +25,7 @@ from mvseg.system.threads import stay_on_one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-AHEAD = 16  # items queued for the workers: a slow one blocks no others, and few are in memory twice
+AHEAD = 16  # limit: items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
 def start_workers(num_workers: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
@@ -76,8 +76,6 @@ def map_in_order(
 
     Args:
         work: what a module holds, or `partial` of it.
-        items: what can be pickled.
-        workers: as `start_workers` gives them.
 
     Raises:
         InputError: a process was killed.

@@ -20,7 +20,8 @@ from mvseg.tracking.compare import Comparison, Sight
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.numbers import LINKING
 
-CALIBRATION = (0.33, 4.08)  # slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
+# fitted: slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
+CALIBRATION = (0.33, 4.08)
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,6 @@ def link_leaves(
 
     Args:
         counts: number of leaves with a shape on each date.
-        costs: see `Comparison`.
         same, different: pairs of sights that a person says are one leaf, or are not.
 
     Raises:

@@ -37,9 +37,7 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
     """The poses of T dates.
 
     Args:
-        num_dates: T.
         looked: {(earlier, later): the poses of two dates that were looked at}.
-        habit: of the pot.
 
     Returns:
         (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)

@@ -94,10 +94,8 @@ def track_leaves(
         results: of two dates or more, in any order: result folders of `mvseg infer` or `mvseg batch`, `Result`s in
             memory, or `PlantOnDate`s.
         times: of each result: numbers (days) or ISO dates; None: 0, 1, 2, ...
-        links: what a person says.
         pots: "fixed": they stand as they stood, and frames agree; "turned": any turn is as likely; "auto": how often
             this plant's pot is turned is learned from its dates.
-        plant: its name.
 
     Returns:
         The tracks. Of each two dates the likeliest alignment is taken, the probability of a link follows from its, and

@@ -26,8 +26,8 @@ from mvseg.training.data import SampleList, read_sample
 from mvseg.training.new_plants import draw_background, list_backgrounds, recolor, render_new_plant
 from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil, tint_leaves
 
-MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
-MIN_INSTANCE_PX = 16  # smaller remains of an instance at the edge of a crop are noise
+MEAN_COLOR = (124, 116, 104)  # definition: RGB; what the detectors' normalisation maps to zero
+MIN_INSTANCE_PX = 16  # chosen: smaller remains of an instance at the edge of a crop are noise
 
 Target = dict[str, Tensor]
 

@@ -92,7 +92,6 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
     Under torchrun every process calls this with the same config. torch's global generators are left as they were.
 
     Args:
-        config: everything about the run.
         model: a detector of your own, with a class for every category of the data, to train in place of
             `build_detector(config.arch, ...)`; `config.arch` is then only its name in the files. If its norms look at
             the batch, the run depends on the number of processes.

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from mvseg.simulation.growth import SimulatedPlant
     from mvseg.simulation.look import Floats
 
-BACKGROUND_PX = 768  # longer side at which background photos are kept in memory
-MOST_LEAVES = 60
+BACKGROUND_PX = 768  # limit: longer side at which background photos are kept in memory
+MOST_LEAVES = 60  # limit: leaves of a simulated plant
 
 
 def render_new_plant(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-SKIN = (225.0, 175.0, 145.0)  # RGB
+SKIN = (225.0, 175.0, 145.0)  # chosen: RGB
 LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 

@@ -18,7 +18,7 @@ from mvseg.training.config import TrainConfig
 
 logger = logging.getLogger(__name__)
 
-WORTHWHILE = 0.9  # of float32's time: bfloat16 must be faster than that to be worth its precision
+WORTHWHILE = 0.9  # chosen: of float32's time: bfloat16 must be faster than that to be worth its precision
 
 
 def choose_bf16(config: TrainConfig, model: nn.Module, *, photos: list[Tensor], targets: list[Target]) -> bool:

@@ -24,8 +24,8 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 
-LIKELY = 0.5  # P of a leaf that is learned: it is likelier a leaf than not
-LEAST_LEAVES = 3  # fewer say too little of a species
+LIKELY = 0.5  # definition: P of a leaf that is learned: it is likelier a leaf than not
+LEAST_LEAVES = 3  # chosen: fewer say too little of a species
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,6 @@ class ViewLabels:
         """The labels of one view in a part of its photo.
 
         Args:
-            view: its index.
             photo: (H, W, 3) uint8 RGB.
             box: xyxy, the part.
             size: (height, width) that the part is scaled to.
@@ -86,7 +85,6 @@ def label_views(masks: Masks, proposals: Masks, photos: ReadPhoto, *, probabilit
     Args:
         masks: D masks with ids; match scores are q, how likely a mask shows its leaf.
         proposals: R masks, everything else that a detector took for a leaf.
-        photos: of the views.
         probabilities: {id: P}, how likely each instance is a leaf; see `are_labels`.
 
     Returns:

@@ -18,9 +18,9 @@ from mvseg.traits.leaf import Measurement, missing
 
 Floats = NDArray[np.float64]
 
-BORDER_PX = 2  # pixels this near to the edge of a mask may show something else
+BORDER_PX = 2  # chosen: pixels this near to the edge of a mask may show something else
 COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index", "senescent_share", "hue")
-YELLOW_DEG = 60.0  # hues from red to here are those of yellow, brown and red leaves
+YELLOW_DEG = 60.0  # chosen: hues from red to here are those of yellow, brown and red leaves
 OUTSIDE = missing("not measured: no photo can show it")
 NO_PIXELS = missing("not measured: no pixel is surely of this leaf")
 NO_PHOTOS = missing("not measured: there are no photos")
@@ -35,7 +35,6 @@ def measure_appearance(
     Args:
         surfaces: {instance id: surface that exists}.
         masks: D masks of the scene, with ids.
-        cameras: V cameras.
         photos: used, if they exist.
 
     Returns:

@@ -23,10 +23,10 @@ Kind = Literal["few_sure_views", "low_quality", "hardly_visible", "stem", "floor
 
 SURELY_STEM = 0.9  # chosen: probability from which an instance is a stem, see `TubeEvidence`
 # Found on simulated plants with masks of a tape on the floor, and on a real basil; see docs/traits.md.
-FLOOR_AREA = 1.8  # times that of the largest other instance
-FAR = 2.0  # lengths of the longest instance but one, from instance to instance
-FEWEST = 3  # instances, for floor and distance to be told
-NUM_POINTS = 400  # of a shape, for distances
+FLOOR_AREA = 1.8  # chosen: times that of the largest other instance
+FAR = 2.0  # chosen: lengths of the longest instance but one, from instance to instance
+FEWEST = 3  # chosen: instances, for floor and distance to be told
+NUM_POINTS = 400  # limit: of a shape, for distances
 
 
 @dataclass(frozen=True)

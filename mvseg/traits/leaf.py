@@ -13,12 +13,12 @@ from mvseg.reconstruction.voxels import VoxelGrid
 
 Floats = NDArray[np.float64]
 
-COARSE = (24, 9)  # grid for standard deviations
-END = 0.25  # share of the midrib whose direction counts as that of its base or tip; less is noise
+COARSE = (24, 9)  # limit: grid for standard deviations
+END = 0.25  # chosen: share of the midrib whose direction counts as that of its base or tip; less is noise
 MIDDLE = np.linspace(0.4, 0.6, 5)  # where the fold is measured
-VAGUE_DEG = 60.0  # standard deviation from which an azimuth says nothing
-PARALLEL = 1e-9  # sine of the angle between directions that span no plane
-FULL_TURN_DEG = 360 - 5e-4  # what is larger is written as 360, with six digits
+VAGUE_DEG = 60.0  # chosen: standard deviation from which an azimuth says nothing
+PARALLEL = 1e-9  # limit: sine of the angle between directions that span no plane
+FULL_TURN_DEG = 360 - 5e-4  # limit: what is larger is written as 360, with six digits
 
 
 @dataclass(frozen=True)

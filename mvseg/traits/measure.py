@@ -139,7 +139,6 @@ def measure_plant(
         surfaces: {instance id: surface}; None where none were asked for.
         voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
-        config: what counts as a leaf.
         stems: ids of instances that are stems, as the user says.
 
     Returns:

@@ -96,11 +96,8 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
     """Order leaves along a stem, and measure their nodes.
 
     Args:
-        tube: the stem, upwards; it exists.
         bases: of the leaves that sit on it.
         frame: (3, 3) rows east, north, up (`level_frame`); None: azimuths start somewhere.
-        source: see `Stem`.
-        number: of the stem.
     """
     curve = curve_of(tube)
     places, misses, along = project_bases(bases, curve)

@@ -75,7 +75,6 @@ def find_stems(
     Args:
         surfaces: {instance id: credible surface} of leaves.
         masks: D masks of the scene, with ids.
-        cameras: V cameras.
         frame: (3, 3) rows east, north, up; None: up is not known.
         photos: used, if they exist.
         tubes: fitted to masks of stems.

@@ -16,7 +16,7 @@ from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
-MOST_BYTES = 1 << 30  # of a table that is read
+MOST_BYTES = 1 << 30  # limit: of a table that is read
 NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "azimuth")
 NODE_COLUMNS = (
     "plant", "stem", "node", "leaf", *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),

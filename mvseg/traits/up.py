@@ -22,7 +22,7 @@ Floats = NDArray[np.float64]
 LEVEL = np.radians(2.0)  # how level cameras are at best
 MOST_TILT = np.radians(10.0)  # root mean square, of cameras that were held level
 MOST_DOUBT = np.radians(6.0)  # standard deviation of the answer
-MOST_BEND = 0.1  # smallest standard deviation of markers' corners over the middle one: they lie in one plane
+MOST_BEND = 0.1  # chosen: smallest standard deviation of markers' corners over the middle one: they lie in one plane
 
 
 def place_scene(
@@ -39,11 +39,9 @@ def place_scene(
     contradict (`Scene.seems_upside_down`).
 
     Args:
-        scene: as it was loaded.
         photos: of the scene; None: they are read where `up` is "board".
         scale: its lengths are multiplied by this.
         unit: name of the unit of the lengths after that.
-        up: see `find_up`.
 
     Raises:
         InputError: a scale of cameras that say their unit, without the unit of the lengths after it; up cannot be

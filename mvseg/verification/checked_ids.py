@@ -44,9 +44,7 @@ def check_ids(
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
             a person corrected or linked keep their ids.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
-        cameras: V cameras.
         config: that the masks were matched with.
-        cache: see `fit_surfaces`.
 
     Returns:
         The same masks; those that moved have q as their match score. Instances that lost all their masks leave gaps
@@ -84,7 +82,6 @@ def find_shared(
         question: of D masks and K candidates.
         leaf: (D,) the candidate that each mask shows; -1 for none.
         names: (K + 1,) ids of the candidates.
-        cameras: V cameras.
         pairs: (mask, own id, other id) that the matcher named.
     """
     regions, candidates, every = question.masks.regions, question.candidates, np.arange(len(leaf))

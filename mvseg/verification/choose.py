@@ -84,7 +84,6 @@ def choose_leaves(
     Args:
         matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
-        cameras: V cameras.
         more: masks of other matchings, of more of the proposals, with such labels, too.
         gone: masks that a person took away; None: nobody edited the masks. Otherwise only the instances of a person's
             masks are candidates here, and `more` has the others.
@@ -92,7 +91,6 @@ def choose_leaves(
             None: for none.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
-        cache: of surfaces, see `fit_surfaces`.
 
     Returns:
         The leaves. Where the cameras see the plant from one side only, by less than `ROUGH.least_parallax`, surfaces
@@ -196,7 +194,6 @@ def gather_candidates(
         table: R' masks.
         is_held: (D,) bool, of the masks of the first matching.
         surfaces: {instance id: surface} of the first matching; None: they are fitted here.
-        cache: see `fit_surfaces`.
     """
     areas = table.regions.areas.double()
     shapes: list[LeafSurface | None] = []

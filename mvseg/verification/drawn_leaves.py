@@ -56,10 +56,8 @@ def follow_drawn(
 
     Args:
         masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
-        cameras: V cameras.
         photos: of the views. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
-        cache: see `fit_surfaces`.
 
     Returns:
         The D masks on the CPU in their order, without half masks, and the new ones after them. And {instance id:

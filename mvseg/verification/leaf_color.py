@@ -13,7 +13,7 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks
 from mvseg.verification.numbers import COLORS
 
-CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
+CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # definition: as OpenCV asks for them
 
 
 @dataclass(frozen=True, eq=False)

@@ -146,7 +146,6 @@ def leaf_features(
     of the length, over theirs, 0 for longer ones (pieces are short); and the log odds of `Candidates.fits`.
 
     Args:
-        candidates: K.
         best: (V, K) q of the best mask of each.
         sure: (V, K) log odds of its detection score.
         share: (V, K), see `Evidence`.

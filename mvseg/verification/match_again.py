@@ -34,7 +34,6 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
             views, nothing is found.
         leaf: (D,) int64, what each mask was matched to, from 0 on; -1 for nothing.
         odds: (D,) log odds that it shows that.
-        cameras: V cameras.
         config: that the masks were matched with.
     """
     found: list[Masks] = []

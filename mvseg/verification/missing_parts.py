@@ -30,8 +30,6 @@ def find_missing_parts(
     Args:
         masks: D masks with ids, on the CPU.
         surfaces: {instance id: surface} of some of them.
-        photos: of the views.
-        cameras: V cameras.
 
     Returns:
         D crops, disjoint from all masks of their view; None where nothing is missing, or most masks of the leaf are

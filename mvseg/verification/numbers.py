@@ -16,7 +16,7 @@ class EvidenceNumbers:
 
     most_px: int = 800  # limit: longer side of the photos on which masks are compared, at most
     fits: float = 0.5  # definition: IoU with what a view shows of a leaf from which a mask shows the leaf
-    open_pixels: int = 100  # unhidden pixels of a surface that a view sees openly, at least
+    open_pixels: int = 100  # chosen: unhidden pixels of a surface that a view sees openly, at least
     shared: float = 0.5  # definition: fraction of the smaller of two masks that is in both, where they show one leaf
 
 
@@ -25,36 +25,36 @@ class RoughNumbers:
     """Surfaces that judge masks before ids are final."""
 
     views: int = 12  # limit: views of an instance that a rough surface is fitted to, at most
-    least_parallax: float = 30.0  # degrees between the directions that most instances are seen from, at least
+    least_parallax: float = 30.0  # chosen: degrees between the directions that most instances are seen from, at least
 
 
 @dataclass(frozen=True)
 class PartNumbers:
     """Masks that show two leaves."""
 
-    each: float = 0.2  # fraction of a mask that each of the two leaves it shows covers, at least
-    both: float = 0.7  # and both together
+    each: float = 0.2  # chosen: fraction of a mask that each of the two leaves it shows covers, at least
+    both: float = 0.7  # chosen: and both together
 
 
 @dataclass(frozen=True)
 class AgainNumbers:
     """Masks that are matched again."""
 
-    least_views: int = 5  # with fewer, surfaces fit wrong masks about as well as right ones: two always agree on one
+    least_views: int = 5  # chosen: of fewer, surfaces fit wrong masks as well: two always agree
     # In turn, those that show another leaf as likely as not, and all that are not sure; what is found without need is
     # not taken (`GivenScores.price`).
-    freed: tuple[float, ...] = (0.5, 0.75)  # q of masks for their own leaf below which they are freed
+    freed: tuple[float, ...] = (0.5, 0.75)  # chosen: q of masks for their own leaf below which they are freed
 
 
 @dataclass(frozen=True)
 class ChoiceNumbers:
     """The choice of leaves and masks among what a detector found."""
 
-    rounds: int = 2  # in the first nothing hides anything, in the second the leaves of the first do
-    same: float = 0.8  # Jaccard index of the masks of two candidates, by area, above which they are one
-    clear: float = 0.6  # share of what views must show of a candidate from which it is a clear leaf
+    rounds: int = 2  # limit: in the first nothing hides anything, in the second the leaves of the first do
+    same: float = 0.8  # chosen: Jaccard index of the masks of two candidates, by area, above which they are one
+    clear: float = 0.6  # chosen: share of what views must show of a candidate from which it is a clear leaf
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
-    least_shown: float = 0.2  # q from which a mask may show a leaf
+    least_shown: float = 0.2  # chosen: q from which a mask may show a leaf
     least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
 
@@ -63,34 +63,34 @@ class ChoiceNumbers:
 class DrawnNumbers:
     """What other views show of leaves that a person drew."""
 
-    least_visible: float = 0.3  # unhidden fraction of a surface that a view sees openly, at least; see `open_pixels`
-    least_colored: float = 0.8  # fraction of the unhidden part that has the colour of leaves, at least
+    least_visible: float = 0.3  # chosen: unhidden fraction of a surface that a view sees openly; see `open_pixels`
+    least_colored: float = 0.8  # chosen: fraction of the unhidden part that has the colour of leaves, at least
     half: float = 0.5  # definition: a mask shows half a leaf if it covers less of what its view shows of the surface
-    rounds: int = 2  # fits: the second one is to what is found where the surface of the first one is
-    beside_px: int = 2  # pixels between leaf colour and where a view may show a leaf, at most
-    most_against: float = 0.15  # fraction of views with another colour at a point of a leaf, at most: stakes hide it
-    reach: float = 0.1  # reach of a leaf beyond its first surface, in roots of the surface's area, at most
+    rounds: int = 2  # limit: fits: the second one is to what is found where the surface of the first one is
+    beside_px: int = 2  # chosen: pixels between leaf colour and where a view may show a leaf, at most
+    most_against: float = 0.15  # chosen: fraction of views with another colour at a point: stakes hide leaves
+    reach: float = 0.1  # chosen: reach of a leaf beyond its first surface, in roots of the surface's area, at most
 
 
 @dataclass(frozen=True)
 class ColorNumbers:
     """The colour of leaves."""
 
-    bins: int = 16  # bins of each channel in which colours are counted
-    blur: float = 1.0  # standard deviation of the Gaussian that smooths the counts, in bins
+    bins: int = 16  # limit: bins of each channel in which colours are counted
+    blur: float = 1.0  # chosen: standard deviation of the Gaussian that smooths the counts, in bins
     # On plants that were found whole, 0.15 to 0.39 (stems, soil and pots), where a quarter was found, 0.48 to 0.84.
-    unexplained: float = 0.5  # fraction of leaf-coloured pixels in no mask above which leaves were missed
+    unexplained: float = 0.5  # chosen: fraction of leaf-coloured pixels in no mask above which leaves were missed
 
 
 @dataclass(frozen=True)
 class SnapNumbers:
     """Edges of masks that move to where colours change."""
 
-    band: float = 0.05  # way that an edge may move, in roots of its mask's area
-    around: int = 3  # bands around a mask in which the photo tells what the background looks like
+    band: float = 0.05  # chosen: way that an edge may move, in roots of its mask's area
+    around: int = 3  # chosen: bands around a mask in which the photo tells what the background looks like
     most_px: int = 100  # limit: root of the area of a mask, larger ones are scaled; with all pixels it is as good
-    lacks: float = 0.05  # fraction of a leaf that its masks lack in most views, from which they are completed
-    least_pixels: int = 10  # pixels surely of leaf, or of background, where an edge moves: GrabCut needs five of each
+    lacks: float = 0.05  # chosen: fraction of a leaf that its masks lack in most views, from which they are completed
+    least_pixels: int = 10  # limit: sure pixels of leaf, or background, at a moved edge; GrabCut needs five
 
 
 EVIDENCE = EvidenceNumbers()

@@ -41,8 +41,6 @@ def snap_masks(
     None grows into another mask of its view, nor do two grow into the same pixel: the first row has it.
 
     Args:
-        masks: D masks.
-        photos: of the views.
         missing: D, the part of its leaf that each mask lacks, see `find_missing_parts`; (): none lacks any.
         cache: {digest of the arguments of `snap`: what it returned}; earlier ones are taken from it, new ones added.
 

@@ -21,7 +21,7 @@ FORMS = (
     "a NumPy array or tensor (N, H, W) or labels (H, W), torchvision's dict, a list of SAM's dicts or "
     "supervision.Detections with masks"
 )
-THRESHOLD = 0.5  # of masks in floats, as torchvision's are
+THRESHOLD = 0.5  # definition: of masks in floats, as torchvision's are
 
 
 def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regions:
@@ -65,7 +65,6 @@ def with_instance_ids(views: Sequence[Any], regions: Regions, instance_ids: Tens
 
     Args:
         views: what `regions_from_masks` was given; it is not changed.
-        regions: what it returned.
         instance_ids: (D,) int64, of `Matching`; -1 = matched to nothing.
 
     Returns:

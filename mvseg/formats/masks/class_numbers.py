@@ -12,17 +12,17 @@ from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.regions import IGNORE_LABEL, Regions
 
-BINARY = 255  # written by segmenters that only separate leaf from background
-SIDE = 256  # pixels: larger masks are scaled down to this
-COMPARABLE = 0.2  # of the largest component's area: smaller ones are ignored
-FAR = 0.5  # gap between components, in the square root of the smaller one's area
-MANY = 0.5  # share of the photos, or of the numbers of one
-PHOTO = 50  # numbers of a label image: with more, it may be a photo
-# Of the pixels at edges, those between their neighbours. Masks of 12 real plants and a simulated one have 0.06 at most
-# (0.08 in the worst photo, of a seedling); those that OpenCV scaled by 0.25 to 4 have 0.13 to 0.58.
+BINARY = 255  # definition: written by segmenters that only separate leaf from background
+SIDE = 256  # limit: pixels: larger masks are scaled down to this
+COMPARABLE = 0.2  # chosen: of the largest component's area: smaller ones are ignored
+FAR = 0.5  # chosen: gap between components, in the square root of the smaller one's area
+MANY = 0.5  # chosen: share of the photos, or of the numbers of one
+PHOTO = 50  # chosen: numbers of a label image: with more, it may be a photo
+# chosen: of the pixels at edges, those between their neighbours. Masks of 12 real plants and a simulated one have 0.06
+# at most (0.08 in the worst photo, of a seedling); those that OpenCV scaled by 0.25 to 4 have 0.13 to 0.58.
 BETWEEN = 0.1
-FEWEST = 500  # pixels at edges of all photos, below which that share means nothing
-BAND = 1024  # rows that are looked at together; neighbours across are not
+FEWEST = 500  # chosen: pixels at edges of all photos, below which that share means nothing
+BAND = 1024  # limit: rows that are looked at together; neighbours across are not
 
 
 def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> None:
@@ -33,7 +33,6 @@ def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> N
     number per leaf, in less than a third of the photos.
 
     Args:
-        regions: the masks.
         between: the sum of the `count_between` of all label images.
         source: the file or folder; messages name it.
 

@@ -9,9 +9,9 @@ import numpy as np
 from mvseg.findings.finding import Rule
 from mvseg.regions import Regions
 
-COVERS = 0.8  # of the photo: the background
-INSIDE = 0.9  # share of a mask that lies in a larger one, from which it is a part of that
-MANY = 0.2  # share of the masks that are such parts, above which they are no leaves that hide each other
+COVERS = 0.8  # chosen: of the photo: the background
+INSIDE = 0.9  # chosen: share of a mask that lies in a larger one, from which it is a part of that
+MANY = 0.2  # chosen: share of the masks that are such parts, above which they are no leaves that hide each other
 
 
 def mask_faults(regions: Regions, sizes: Sequence[Sequence[int]]) -> list[Rule]:

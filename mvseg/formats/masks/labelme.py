@@ -21,7 +21,7 @@ from mvseg.formats.coco import check_corners, decode_segmentation
 from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
 
-CIRCLE_CORNERS = 64
+CIRCLE_CORNERS = 64  # limit: corners of the polygon of a circle
 NO_MASKS = ("__ignore__", "_background_")
 
 

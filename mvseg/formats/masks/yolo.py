@@ -18,7 +18,7 @@ from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.formats.text_file import read_text, read_yaml
 
 NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
-MAX_BYTES = 1 << 28  # of a photo
+MAX_BYTES = 1 << 28  # limit: of a photo
 YOLO_TRACKS = "YOLO tracks"  # a kind of masks: each line ends in a confidence and the number of a track
 
 

@@ -21,8 +21,10 @@ from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_
 from mvseg.matching.partition import Clusters, members_of
 from mvseg.matching.view_graph import ViewGraph
 
-# Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
+# chosen: log-odds that two regions show one instance, by epipolar weight: what was counted on degraded masks of
+# development plants, by a command that is gone
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
+# chosen: the same
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
 
 Floats = NDArray[np.floating]
@@ -79,7 +81,6 @@ class ClusterScores:
         a region takes the mean of its pixels, or -hidden without pixels.
 
         Args:
-            view: the view.
             numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out. Regions of the view itself do
                 not count.
 
@@ -94,9 +95,6 @@ class ClusterScores:
 
     def coverages(self, clusters: Clusters) -> Floats:
         """Where clusters expect to be seen in each view, R(c, n).
-
-        Args:
-            clusters: of all D regions.
 
         Returns:
             (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best hypothesis shows
@@ -142,7 +140,6 @@ class ClusterScores:
         """What the regions of one view would gain by joining the clusters of the other views.
 
         Args:
-            view: the view.
             numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out.
             coverages: `coverages` of an earlier partition; newer clusters, which it does not have, cover nothing.
         """

@@ -41,7 +41,6 @@ def match_nview(
 
     Args:
         regions: D regions in V views, in any order.
-        cameras: V cameras.
         graph: the epipolar weights of the regions, and their links.
         residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
 
@@ -99,7 +98,6 @@ def find_clusters(
 
     Args:
         regions: D regions, ordered by view.
-        cameras: V cameras.
         graph: their epipolar weights, and their links.
         residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
     """

@@ -24,8 +24,6 @@ def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> 
 
     Args:
         scores: of D regions, ordered by view.
-        clusters: their partition.
-        regions: the D regions.
 
     Returns:
         One entry per such mask, by view; the ids are cluster numbers plus one.
@@ -82,10 +80,6 @@ def second_part(scores: ClusterScores, clusters: Clusters, regions: Regions, *, 
 
     Args:
         scores: of D regions, ordered by view.
-        clusters: their partition.
-        regions: the D regions.
-        region: the merged one.
-        second: the other cluster.
 
     Returns:
         (h, w) bool on the CPU, in the region's box and inside its mask; nowhere for a region without sampled pixels.

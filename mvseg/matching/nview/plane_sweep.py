@@ -27,7 +27,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
-# Labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
+# definition: labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
 EMPTY, OUTSIDE = -1, -2
 
 Floats = NDArray[np.float32]
@@ -112,7 +112,6 @@ def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1) ->
 
     Args:
         regions: D regions ordered by view (int64 `view_index` must not decrease).
-        cameras: V cameras.
         dilation_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
 
     Returns:

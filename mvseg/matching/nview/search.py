@@ -52,7 +52,6 @@ def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = 
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:
-        scores: of D regions.
         clusters: to start from.
         join_fragments: left-over regions may join a cluster that has a region in their view already.
     """

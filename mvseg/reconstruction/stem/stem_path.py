@@ -43,7 +43,6 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
     """Find the line of cells through which the cheapest paths between the leaves run.
 
     Args:
-        cells: of `find_cells`.
         leaves: {leaf: (P, 3) points on its surface}.
 
     Returns:

@@ -90,7 +90,6 @@ def find_cells(views: Sequence[ThinView], points: Floats, axes: Floats) -> ThinC
     """Cells around a plant that most views which see them show as thin; small ones only where larger ones do.
 
     Args:
-        views: of `see_thin`.
         points: (P, 3) of the plant.
         axes: (3, 3) in rows, of the plant itself, along which cells lie.
     """

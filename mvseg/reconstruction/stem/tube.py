@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mvseg.reconstruction.numbers import TUBE
 from mvseg.reconstruction.surface.leaf_patch import Floats, spline_basis
 
-COUNTS = (6, 3)  # coefficients of the axis, vectors, and of the radius (a definition)
+COUNTS = (6, 3)  # definition: coefficients of the axis, vectors, and of the radius
 AXIS, RADIUS = COUNTS
 NUM_ROWS, NUM_SIDES = TUBE.mesh
 

@@ -92,7 +92,6 @@ def tube_evidence(
     Args:
         regions: D regions. Those matched to nothing hide others as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
-        cameras: V cameras.
         surfaces: {instance id: surface}; rough ones will do.
         least_aspect: min. `TubeEvidence.relative_aspect`; stems have more than `TUBE.least_aspect`.
 
@@ -127,7 +126,6 @@ def compare_tube(
     """The evidence of the masks of one candidate with a surface.
 
     Args:
-        masks: of the candidate.
         surface: that exists.
         usual_aspect: median length over width of the plant's surfaces.
         mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large.

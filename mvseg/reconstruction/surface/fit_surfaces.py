@@ -61,7 +61,6 @@ def fit_surfaces(
     Args:
         regions: D regions. Those matched to nothing hide leaves as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
-        cameras: V cameras.
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
         same_segmenter: surfaces whose `offsets_px` tell how the masks err; None: those that are fitted here. With those
             of a scene before edits, an edit of one leaf does not move all others a little.

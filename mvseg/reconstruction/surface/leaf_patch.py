@@ -21,7 +21,7 @@ from mvseg.reconstruction.numbers import FIT, PRIOR
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-COUNTS = (7, 12, 4, 3)  # m, Q, R, S have so many coefficients (a definition); fewer for Q cannot follow lobes
+COUNTS = (7, 12, 4, 3)  # definition: m, Q, R, S have so many coefficients; fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 

@@ -26,7 +26,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
-MESH_SHAPE = (64, 17)  # a mesh has so many rows and columns of vertices (a definition)
+MESH_SHAPE = (64, 17)  # definition: a mesh has so many rows and columns of vertices
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from skimage.measure import find_contours
 from mvseg.reconstruction.numbers import STACK
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
-FRAME = -1  # what lies outside the image has this label (a definition)
+FRAME = -1  # definition: what lies outside the image has this label
 Labels = NDArray[np.int32]
 
 
@@ -184,7 +184,6 @@ def stack_masks(
     Args:
         masks: S frames of its own pixels, each with at least one: full ones (H, W), or parts (h, w) of these.
         others: S full frames (H, W) with the ids (> 0) of other instances, 0 elsewhere.
-        views: the view index of each.
         px_from_world: (S, 3, 4), pixel centres at half integers.
         mask_corners: x, y of the top-left pixel of each mask that is a part.
         own: the id of the leaf itself, which hides nothing, in `others`.

@@ -196,7 +196,6 @@ def hiding_pixels(
     but for which of several ids a pixel has.
 
     Args:
-        masks: of the leaf.
         points: (rows, columns, 3) grid points of its present patch.
         others: instance id -> grid points of its patch. Instances without a patch may hide anything.
         margin: world units by which another one must be farther away to lie behind, or nearer to lie in front.

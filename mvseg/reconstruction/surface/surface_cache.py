@@ -76,11 +76,7 @@ def name_second(
     """Digest of all that a second fit follows from.
 
     Args:
-        name: `name_first`.
-        masks: of the leaf.
-        approach: the first fit.
         others: {instance id: points of its grid} that may hide the leaf; their ids do not matter.
-        errors: of all masks.
     """
     hiding = sorted(_digest(points, masks.others == other) for other, points in others.items())
     of_all = [] if errors is None else [errors.density, np.array(errors.sd_px)]

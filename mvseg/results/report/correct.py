@@ -21,7 +21,7 @@ from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 
-COLUMNS = 33  # columns of the grid of a lens: between its points, straight lines are less than a pixel off
+COLUMNS = 33  # limit: columns of the grid of a lens: between its points, straight lines are less than a pixel off
 
 
 def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:

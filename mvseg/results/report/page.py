@@ -47,8 +47,6 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
 
     Args:
         result: what is shown; without shapes the leaves are missing in 3D.
-        pictures: one per view.
-        run: what run.json says.
         is_served: `mvseg correct` serves it: it sends each edit there, and shows the consequences. Otherwise it
             connects to nothing.
     """
