@@ -30,7 +30,7 @@ from mvseg.training.config import TrainConfig
 from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, learning_rate
 from mvseg.training.view_labels import ViewLabels
 
-STEPS = 75
+STEPS = 40  # chosen: steps of a round, of two samples each
 RECIPE = TrainConfig(
     output=Path(),  # no path is used
     from_results=Path(),
@@ -45,8 +45,8 @@ RECIPE = TrainConfig(
 # close-up of another species, after 40 steps, 0.479 -> 0.481, and 0.568 with these layers alone (lobed-187 of
 # `benchmarks/unruly_plants.py`, single photos at 384 px).
 FIRST_LAYERS = tuple(f"body.{name}" for name in FROZEN)
-IGNORED = 0  # class of the ignored pixels, which pass the augmentation as if they were an instance
-SPARED = 0.25  # a box with a larger share of ignored pixels is no example of background
+IGNORED = 0  # definition: class of the ignored pixels, which pass the augmentation as if they were an instance
+SPARED = 0.25  # chosen: a box with a larger share of ignored pixels is no example of background
 
 
 def fine_tune(
@@ -67,11 +67,9 @@ def fine_tune(
     Args:
         detector: any torchvision Mask R-CNN whose norms do not look at the batch, as `load_detector` gives it (norms
             not folded); it stays as it is.
-        photos: of V views.
         labels: of these views; views without a label teach nothing.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the detector will look at. It learns at the size that its
             transform gives them.
-        num_steps: of two samples each.
         seed: of the order of the samples, their augmentation, and the samplers of the losses.
 
     Returns:
