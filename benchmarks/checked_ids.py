@@ -52,13 +52,13 @@ from mvseg.verification.evidence import see
 from mvseg.verification.shown_leaves import (
     GIVEN,
     GivenScores,
-    Question,
+    MaskQuestion,
     ask,
     assign,
     gained,
-    settle,
+    given_features,
+    settle_masks,
     show_odds,
-    shows_features,
 )
 
 KINDS_HERE = (*KINDS, "pieces")
@@ -120,7 +120,7 @@ class Study:
 
     given: Given
     before: Tensor
-    question: Question
+    question: MaskQuestion
     of_candidate: np.ndarray
 
     @staticmethod
@@ -162,7 +162,7 @@ def mask_samples(each: Study) -> tuple[np.ndarray, np.ndarray]:
     is_asked = question.is_known & (each.of_candidate > 0) & ~np.asarray(candidates.certain.any(1))[:, None]
     is_near = candidates.is_credible & (evidence.claimed > NEAR)
     rows = np.asarray(is_asked & (is_near | ~np.isnan(candidates.matched)))
-    return shows_features(candidates, evidence)[rows], each.is_right[rows]
+    return given_features(candidates, evidence)[rows], each.is_right[rows]
 
 
 def leaf_samples(each: Study, fitted: GivenScores) -> Iterator[tuple[float, bool]]:
@@ -178,7 +178,7 @@ def leaf_samples(each: Study, fitted: GivenScores) -> Iterator[tuple[float, bool
 
 def judge(each: Study, fitted: GivenScores) -> str:
     """ARI with these numbers, and how many ids become wrong and right."""
-    found, _ = settle(each.question, fitted)
+    found, _ = settle_masks(each.question, fitted)
     ids = torch.from_numpy(np.where(found >= 0, found + 1, -1))
     before = has_right_id(each.before.numpy(), each.given.leaf.numpy())
     after = each.right_ids(found)

@@ -26,11 +26,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.fit_costs import small_specs
 from benchmarks.tracking import read_places, see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Alignment, Habit, Poses, judge, list_poses, pose_gain, refine
+from mvseg.tracking.align import Alignment, Habit, Poses, judge, list_poses, pose_gain, refine_alignment
 from mvseg.tracking.associate import link_leaves
 from mvseg.tracking.compare import compare_dates
 from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.leaves import Leaves, Pair, leaves_of
+from mvseg.tracking.leaves import DateLeaves, Pair, leaves_of
 from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.place_dates import place_dates
 
@@ -38,7 +38,7 @@ NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
 Dated = tuple[PlantOnDate, list[int]]
 Looked = dict[tuple[int, int], Poses]
 Placed = tuple[float, int, bool]  # gain of the pose, number of leaves, whether the pose is right
-Seen = tuple[list[Leaves], list[np.ndarray], list[float], bool]  # by date: leaves, true ids (0: none), days; knows up
+Seen = tuple[list[DateLeaves], list[np.ndarray], list[float], bool]  # by date: leaves, true ids, days; knows up
 
 
 def see(plant: list[Dated]) -> Seen:
@@ -88,7 +88,7 @@ def judge_placed(seen: Seen, looked: Looked, *, is_other: bool) -> list[Placed]:
     poses, roots, _ = place_dates(len(seen[0]), looked, habit)
     found: list[Placed] = []
     for (earlier, later), of_pair in looked.items():
-        refined = refine(of_pair.pair, np.linalg.inv(poses[later]) @ poses[earlier])
+        refined = refine_alignment(of_pair.pair, np.linalg.inv(poses[later]) @ poses[earlier])
         right = False if is_other else is_right(seen, (earlier, later), refined)
         if roots[earlier] == roots[later] and len(refined.pairs) and right is not None:
             pair = of_pair.pair

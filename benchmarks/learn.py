@@ -40,7 +40,7 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import find_in_photos, know, look_once
+from mvseg.pipeline.find_in_photos import find_in_photos, plant_of_pass, run_pass
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
@@ -164,7 +164,7 @@ def main() -> None:
         runs = [show("as it is", plant, truth, stays="", begun=begun)]
         for size in args.sizes:
             begun, detect = time.process_time(), replace(config.detect, image_size=size)
-            seen = know(opened, look_once(opened, detect, cache=cache, boxes=first.boxes))
+            seen = plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=first.boxes))
             runs.append(show(f"at {size} px", seen, truth, stays="", begun=begun))
         if args.next is not None:
             see_next(args.next, None, "the next plant", cache=cache)

@@ -31,7 +31,7 @@ from mvseg.matching.nview.pieces import PIECE, piece_features
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, list_scenes, plant_index
+from mvseg.simulation.dataset import PRESETS, list_specs, plant_index
 from mvseg.simulation.growth import grow_plant
 
 LEAVES, VIEWS, PLANTS, STRAPS = (8, 16, 32), (5, 10), 2, (8, 12)
@@ -53,7 +53,7 @@ def list_kinds(cache: Path) -> Iterator[tuple[str, Regions, torch.Tensor, Camera
                 regions = regions_from_label_maps(maps)
                 leaf = shown_instances(regions, list(true), count_background=False)
                 yield f"strap {num_leaves} {number}", regions, leaf, cameras
-    for spec in list_scenes(PRESETS["paper-eval"], 0):
+    for spec in list_specs(PRESETS["paper-eval"], 0):
         is_asked = spec.num_leaves in LEAVES and spec.num_views in VIEWS and plant_index(spec) < PLANTS
         if spec.split == "dev" and is_asked:
             scene = load_maps(spec, cache)

@@ -68,7 +68,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
+from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, plant_index
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
@@ -161,7 +161,7 @@ def compare_matchings(before: list[tuple[np.ndarray, ...]], after: list[tuple[np
 
 
 def spec_of(num_views: int, num_leaves: int, plant: int = 0) -> SceneSpec:
-    specs = (spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev")
+    specs = (spec for spec in list_specs(PRESETS["paper-eval"], 0) if spec.split == "dev")
     wanted = num_views, num_leaves, plant
     return next(spec for spec in specs if (spec.num_views, spec.num_leaves, plant_index(spec)) == wanted)
 
@@ -331,7 +331,7 @@ MATCHED = (5, 16, None)
 
 
 def thirds_of_reconstruction(args: argparse.Namespace) -> None:
-    specs = [spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev"]
+    specs = [spec for spec in list_specs(PRESETS["paper-eval"], 0) if spec.split == "dev"]
     scenes = []
     for num_views, num_leaves, family in (*SHAPES, MATCHED):
         fits = (each for each in specs if (each.num_views, each.num_leaves) == (num_views, num_leaves))

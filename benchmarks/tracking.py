@@ -59,7 +59,7 @@ from mvseg.simulation.series import (
     plan_plant,
 )
 from mvseg.tracking.dates import Number, PlantOnDate, SeenLeaf, read_date, see_surface
-from mvseg.tracking.leaves import Leaves, leaves_of
+from mvseg.tracking.leaves import DateLeaves, leaves_of
 from mvseg.tracking.numbers import SIGHTS
 from mvseg.tracking.track import Tracks, track_leaves
 from mvseg.traits.measure import measure_plant
@@ -187,15 +187,15 @@ def measure(truth: Labels, found: Labels) -> dict[str, float]:
 # --- baselines: links of the leaves with a shape of consecutive dates
 
 
-def by_base(first: Leaves, second: Leaves) -> np.ndarray:
+def by_base(first: DateLeaves, second: DateLeaves) -> np.ndarray:
     """Distances of base points."""
     return np.linalg.norm(first.bases[:, None] - second.bases[None], axis=-1)
 
 
-def by_shape(first: Leaves, second: Leaves) -> np.ndarray:
+def by_shape(first: DateLeaves, second: DateLeaves) -> np.ndarray:
     """Distances of length, chord and height in units of their spread."""
 
-    def features(leaves: Leaves) -> np.ndarray:
+    def features(leaves: DateLeaves) -> np.ndarray:
         chord = np.linalg.norm(leaves.midribs[:, -1] - leaves.midribs[:, 0], axis=1)
         return np.column_stack([leaves.lengths, chord, leaves.midribs[:, :, 2].mean(1), leaves.chords[:, 2]])
 
@@ -204,13 +204,13 @@ def by_shape(first: Leaves, second: Leaves) -> np.ndarray:
     return np.linalg.norm((one[:, None] - other[None]) / spread, axis=-1)
 
 
-def by_rank(first: Leaves, second: Leaves) -> np.ndarray:
+def by_rank(first: DateLeaves, second: DateLeaves) -> np.ndarray:
     """Differences of the rank from the bottom, as PhenoTrack3D orders leaves (without its alignment of sequences)."""
     one, other = (np.argsort(np.argsort(leaves.bases[:, 2])) for leaves in (first, second))
     return np.abs(one[:, None] - other[None]).astype(float)
 
 
-def by_cpd(first: Leaves, second: Leaves) -> np.ndarray:
+def by_cpd(first: DateLeaves, second: DateLeaves) -> np.ndarray:
     """Distances of leaves after rigid, then deformable coherent point drift of all their points."""
     from pycpd import DeformableRegistration, RigidRegistration
 
@@ -230,7 +230,7 @@ def by_cpd(first: Leaves, second: Leaves) -> np.ndarray:
     return np.linalg.norm(bent[:, None, :, None] - other[None, :, None], axis=-1).min(3).mean(2)
 
 
-BASELINES: dict[str, Callable[[Leaves, Leaves], np.ndarray]] = {
+BASELINES: dict[str, Callable[[DateLeaves, DateLeaves], np.ndarray]] = {
     "nearest base": by_base, "shape": by_shape, "rank": by_rank, "cpd": by_cpd,
 }  # fmt: skip
 

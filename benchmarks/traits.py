@@ -40,7 +40,7 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.simulation.blades import Leaf
-from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_specs
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import grow_plant
 from mvseg.system.worker_pool import run_all
@@ -194,7 +194,7 @@ def main() -> None:
         parser.error("expected --cache DIR or --real FOLDER")
     plants = args.plants * len(EVALUATED_FAMILIES)
     preset = Preset(plants=((args.split, plants),), leaves=(NUM_LEAVES,), views=tuple(args.views))
-    scenes = [spec for spec in list_scenes(preset, args.seed) if spec.family in args.families]
+    scenes = [spec for spec in list_specs(preset, args.seed) if spec.family in args.families]
     work = partial(run_scene, cache=args.cache, kinds=args.masks)
     records = [record for found in run_all(work, scenes, num_workers=args.workers) for record in found]
     if args.json:

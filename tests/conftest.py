@@ -17,7 +17,7 @@ import torch
 
 from mvseg import demo
 from mvseg.checks import photo_matches
-from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair
+from mvseg.checks.photo_matches import PhotoMatches, find_photo_features, match_pair
 from mvseg.cli import command
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
@@ -64,7 +64,7 @@ def one_look() -> Iterator[None]:
     def find(photo: np.ndarray) -> Sift:
         key = photo.shape, hashlib.sha256(photo.tobytes()).digest()
         if key not in found:
-            found[key] = find_features(photo)
+            found[key] = find_photo_features(photo)
         return found[key]
 
     def match(views: tuple[int, int], first: Sift, second: Sift, *, unit_px: float) -> PhotoMatches:
@@ -74,7 +74,7 @@ def one_look() -> Iterator[None]:
         return matched[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_matches, "find_features", find)
+        patch.setattr(photo_matches, "find_photo_features", find)
         patch.setattr(photo_matches, "match_pair", match)
         yield
 

@@ -17,7 +17,7 @@ from mvseg.scene import Cameras, Scene
 
 @dataclass(frozen=True, eq=False)
 class FoundMasks:
-    """As `mvseg.detection.find_leaves.Look`."""
+    """As `mvseg.detection.find_leaves.Pass`."""
 
     sure: Matching
     excessive: Masks

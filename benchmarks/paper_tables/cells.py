@@ -15,7 +15,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
 from mvseg.simulation import dataset
-from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras
+from mvseg.simulation.dataset import Preset, SceneSpec, list_specs, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.system.atomic import write_text_whole
@@ -52,7 +52,7 @@ class Cell:
 
 def list_cells(preset: Preset) -> list[SceneSpec]:
     """The scenes of a preset, the cheapest first."""
-    return sorted(list_scenes(preset, SEED), key=lambda spec: (spec.num_leaves * spec.num_views, spec.folder))
+    return sorted(list_specs(preset, SEED), key=lambda spec: (spec.num_leaves * spec.num_views, spec.folder))
 
 
 def open_cell(spec: SceneSpec, preset: Preset, cache: Path) -> Cell:

@@ -37,7 +37,7 @@ def write_tables(
         write_table(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
 
 
-def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
+def read_batch_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
     """The rows of a table of a finished batch, which has these columns and perhaps others.
 
     Raises:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mvseg._version import made_by
-from mvseg.batch.tables import read_table
+from mvseg.batch.tables import read_batch_table
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import Edit, load_corrections
 from mvseg.errors import InputError
@@ -23,7 +23,7 @@ from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.numbers import PAGE
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
 from mvseg.tracking.recorded import PlantResults, find_plant_links, record_plants
-from mvseg.tracking.tables import join_tables, write_tables
+from mvseg.tracking.tables import join_tables, write_track_tables
 from mvseg.tracking.track import track_leaves
 
 
@@ -42,10 +42,10 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer.
 
     Raises:
-        InputError: see `read_table`; or no plant has two dates.
+        InputError: see `read_batch_table`; or no plant has two dates.
     """
     scenes: dict[str, list[tuple[str, str]]] = {}
-    for row in read_table(batch, "summary.csv", ("scene", "plant", "time", "state")):
+    for row in read_batch_table(batch, "summary.csv", ("scene", "plant", "time", "state")):
         if row["state"] == "done":
             scenes.setdefault(row["plant"], []).append((row["scene"], row["time"]))
     plants = [
@@ -74,7 +74,7 @@ def track_plants(
     One plant is in memory at a time in each process. A plant that fails has a `sentence`; the others continue.
 
     Args:
-        out: the tables of `write_tables`, tracks.html and run.json; of several plants, the pages
+        out: the tables of `write_track_tables`, tracks.html and run.json; of several plants, the pages
             lie in `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
@@ -139,7 +139,7 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
         return TrackedPlant(sentence=f"plant {plant.plant}: {error}")
     growth = measure_growth(tracks)
     place.mkdir(parents=True, exist_ok=True)
-    write_tables(place, tracks, growth)
+    write_track_tables(place, tracks, growth)
     if report:
         write_page(place, tracks, growth)
     warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.findings, *lost.values()))

@@ -78,7 +78,7 @@ class FeatureNumbers:
 
 
 @dataclass(frozen=True)
-class ImageNumbers:
+class PhotoNumbers:
     """Masks and photos on their own, and shapes of the target in photos."""
 
     tiny_px: int = 30  # chosen: pixels of a mask that carries information, at least
@@ -101,4 +101,4 @@ class ImageNumbers:
 CAMERAS = CameraNumbers()
 AGREEMENT = AgreementNumbers()
 FEATURES = FeatureNumbers()
-IMAGES = ImageNumbers()
+IMAGES = PhotoNumbers()

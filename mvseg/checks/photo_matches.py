@@ -56,7 +56,7 @@ def match_photos(read: ReadPhoto, cameras: Cameras) -> list[PhotoMatches]:
     features = {}
     for view in progress_bar(wanted, name="features of photos", unit="photo"):
         try:
-            features[view] = find_features(read(view))
+            features[view] = find_photo_features(read(view))
         except InputError:
             continue
     return [
@@ -84,7 +84,7 @@ def neighbours(cameras: Cameras) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def find_features(photo: NDArray[np.uint8]) -> Sift:
+def find_photo_features(photo: NDArray[np.uint8]) -> Sift:
     """Features of a photo (H, W, 3)."""
     return find_sift(photo, image_size=FEATURES.side, most=FEATURES.most_features, contrast=FEATURES.contrast)
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.corrections.corrected import APPLIED, CONTRADICTED, NOTHING, PASSED, Corrected, Fate, Refused, Whole
+from mvseg.corrections.corrected import APPLIED, CONTRADICTED, NOTHING, PASSED, Corrected, Fate, RejectedPixel, Whole
 from mvseg.corrections.edited_mask import EditedMask, Key, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.corrections.numbers import EDITS
@@ -68,7 +68,7 @@ class _Edited:
     everywhere: tuple[_About, ...] = ()
     words: tuple[tuple[str, int, Key], ...] = ()
     rejected: tuple[tuple[int, EditedMask], ...] = ()
-    refused: tuple[Refused, ...] = ()
+    refused: tuple[RejectedPixel, ...] = ()
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -207,7 +207,7 @@ def _reject(edited: _Edited, number: int, edit: Reject, scene: Scene) -> _Edited
     try:
         mask = _mask_at(edited, place, scene)
     except _Lost as error:
-        nothing = Refused(number, *_pixel_at(scene, place), edit.everywhere)
+        nothing = RejectedPixel(number, *_pixel_at(scene, place), edit.everywhere)
         lost = edited.with_fate(Fate(number, edit.op, NOTHING, str(error)))
         return replace(lost, refused=(*lost.refused, nothing))
     if edit.everywhere:

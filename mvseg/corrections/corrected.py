@@ -34,7 +34,7 @@ class Fate:
 
 
 @dataclass(frozen=True)
-class Refused:
+class RejectedPixel:
     """A pixel where a person says that no leaf is, and where no mask is: it may be the answer to a question, see
     `settle`.
 
@@ -77,7 +77,7 @@ class Corrected:
     links: Links
     last_edits: Tensor
     everywhere: tuple[Whole, ...]
-    refused: tuple[Refused, ...]
+    refused: tuple[RejectedPixel, ...]
     fates: tuple[Fate, ...]
 
 

@@ -33,7 +33,7 @@ class EditNumbers:
 
 
 @dataclass(frozen=True)
-class DoubtNumbers:
+class QuestionNumbers:
     """What a person is asked, also of places that have the colour of leaves and no mask. Doubts only sort questions."""
 
     least: float = 0.3  # chosen: doubt from which a question is asked
@@ -62,4 +62,4 @@ class DoubtNumbers:
 
 
 EDITS = EditNumbers()
-DOUBTS = DoubtNumbers()
+DOUBTS = QuestionNumbers()

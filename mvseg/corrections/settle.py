@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from mvseg.corrections.corrected import APPLIED, Fate, Refused
+from mvseg.corrections.corrected import APPLIED, Fate, RejectedPixel
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LeftOut
 from mvseg.verification.evidence import paint_view
 
 
-def settle(
+def settle_edits(
     edits: Sequence[Fate],
-    refused: Sequence[Refused],
+    refused: Sequence[RejectedPixel],
     left: Sequence[LeftOut],
     surfaces: Mapping[int, LeafSurface],
     *,

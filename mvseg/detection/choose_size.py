@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from mvseg.detection.find_leaves import Found
+from mvseg.detection.find_leaves import PassResult
 from mvseg.detection.numbers import DETECTION
 
 
-def choose_size(see: Callable[[int], Found], first: Found) -> list[Found]:
+def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[PassResult]:
     """Look again and again at a smaller size, as long as the agreed area grows.
 
     Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), one size without
@@ -26,7 +26,7 @@ def choose_size(see: Callable[[int], Found], first: Found) -> list[Found]:
     Returns:
         What was found at the best size, see `order_sizes`.
     """
-    looked, size, num_misses = [first], float(first.looks[0].longest), 0
+    looked, size, num_misses = [first], float(first.passes[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
         found, best = see(round(size)), max(looked, key=lambda each: each.agreed_area)
         num_misses = 0 if found.agreed_area > best.agreed_area else num_misses + 1
@@ -36,7 +36,7 @@ def choose_size(see: Callable[[int], Found], first: Found) -> list[Found]:
     return order_sizes(looked)
 
 
-def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> list[Found]:
+def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> list[PassResult]:
     """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
 
     Args:
@@ -51,7 +51,7 @@ def choose_near(see: Callable[[int], Found], size: int, *, most: int) -> list[Fo
     return order_sizes([see(each) for each in sizes])
 
 
-def order_sizes(looked: Sequence[Found]) -> list[Found]:
+def order_sizes(looked: Sequence[PassResult]) -> list[PassResult]:
     """What was found where the agreed area is largest; of equals, what comes first. And at the next best size, if some
     of the views cannot tell the two apart (`DETECTION.as_good`): then all of them should."""
     ordered = sorted(looked, key=lambda each: -each.agreed_area)

@@ -12,7 +12,7 @@ from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass
-from mvseg.detection.find_leaves import Look
+from mvseg.detection.find_leaves import Pass
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.folded_norms import fold_norms
@@ -32,7 +32,7 @@ def detect_scene(
     match: MatchConfig = MatchConfig(),
     cache: CachedDetections | None = None,
     boxes: Tensor | None = None,
-) -> Look:
+) -> Pass:
     """Look for instances in every photo, and again, larger, where the plant fills a small part of the photos.
 
     Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
@@ -40,10 +40,10 @@ def detect_scene(
     Args:
         photos: of the scene, with its cameras.
         config: which detector, at which size, and what it finds.
-        boxes: (V, 4) int64 xyxy, the parts of the photos that show the plant, from an earlier look; None: look for it.
+        boxes: (V, 4) int64 xyxy, the parts of the photos that show the plant, from an earlier pass; None: look for it.
 
     Returns:
-        The look, matched with the cameras of the photos. Warns (InputWarning) of photos of more proposals than are
+        The pass, matched with the cameras of the photos. Warns (InputWarning) of photos of more proposals than are
         taken: a detector that knows nothing proposes masks everywhere, each of which the views would have to judge.
 
     Raises:
@@ -61,18 +61,18 @@ def detect_scene(
     ).to(device)
     made_by = describe_detector(config, model, device)
 
-    def look_at(boxes: Tensor | None) -> Look:
+    def run_pass(boxes: Tensor | None) -> Pass:
         found = _detect(model, photos, boxes, cache=cache, made_by=made_by)
-        return Look.of(model, found, cameras, boxes=boxes, min_score=config.min_score)
+        return Pass.of(model, found, cameras, boxes=boxes, min_score=config.min_score)
 
-    look = look_at(boxes)
+    detected = run_pass(boxes)
     if boxes is None and config.crop == "auto":
-        boxes = boxes_for_second_pass(look.sure.masks, cameras, longest=model.transform.max_size)
-        look = look if boxes is None else look_at(boxes)
-    if num_full := sum(len(each["scores"]) >= DETECTION.most_proposals for each in look.detections):
+        boxes = boxes_for_second_pass(detected.sure.masks, cameras, longest=model.transform.max_size)
+        detected = detected if boxes is None else run_pass(boxes)
+    if num_full := sum(len(each["scores"]) >= DETECTION.most_proposals for each in detected.detections):
         values = {"count": num_full, "most": DETECTION.most_proposals}
         warn(Finding("very_many_proposals", values=values))
-    return look
+    return detected
 
 
 def _detect(

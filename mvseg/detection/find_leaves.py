@@ -26,7 +26,7 @@ from mvseg.verification.leaf_scores import rate_pass
 
 
 class Detector(Protocol):
-    """What a look needs of its detector, a `MultiViewMaskRCNN`."""
+    """The parts of a `MultiViewMaskRCNN` that a pass needs."""
 
     transform: Any  # torchvision's
 
@@ -43,7 +43,7 @@ class Detector(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Pass:
     """What a detector proposes in V photos, or in parts of them, seen at one size.
 
     Attributes:
@@ -66,11 +66,11 @@ class Look:
         *,
         boxes: Tensor | None = None,
         min_score: float,
-    ) -> Look:
-        """A look, matched from `min_score` on with the V cameras of the photos."""
+    ) -> Pass:
+        """A pass, matched from `min_score` on with the V cameras of the photos."""
         nothing = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=len(cameras))), MatchReport("none"))
-        look = Look(model, detections, boxes, nothing)
-        return replace(look, sure=look.match(cameras, min_score))
+        unmatched = Pass(model, detections, boxes, nothing)
+        return replace(unmatched, sure=unmatched.match(cameras, min_score))
 
     @property
     def longest(self) -> int:
@@ -99,26 +99,26 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class PassResult:
     """The leaves that were found, and what they were chosen from.
 
     Attributes:
-        looks: at the photos, that the proposals come from.
+        passes: at the photos, that the proposals come from.
         leaves: that the views choose; without `DetectConfig.verify`, what was matched.
         proposals: R masks, the excessive set.
         matched: tables of masks that are matched, the sure ones first; their `labels` are rows of `proposals`.
         report: of the sure ones.
-        pixel: width of a pixel of the first look, in pixels of the photos.
-        said: what there is to warn of, should it stay.
+        pixel: width of a pixel of the detector in the first pass, in pixels of the photos.
+        findings: to warn of, if the result stays.
     """
 
-    looks: tuple[Look, ...]
+    passes: tuple[Pass, ...]
     leaves: Leaves
     proposals: Masks
     matched: tuple[Masks, ...]
     report: MatchReport
     pixel: float
-    said: tuple[Finding, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
     @property
     def agreed_area(self) -> float:
@@ -127,29 +127,29 @@ class Found:
 
 
 def find_leaves(
-    looks: Sequence[Look],
+    passes: Sequence[Pass],
     cameras: Cameras,
     *,
     config: DetectConfig = DetectConfig(),
     splits: bool = False,
     cache: SurfaceCache | None = None,
-) -> Found:
-    """The views choose leaves and masks from everything that one or more looks propose, see `choose_leaves`.
+) -> PassResult:
+    """The views choose leaves and masks from everything that one or more passes propose, see `choose_leaves`.
 
     Args:
-        looks: at the same photos, matched with the same cameras.
+        passes: at the same photos, matched with the same cameras.
         config: `verify`, `min_score` and `min_probability`.
         splits: cut masks that seem to show two leaves, before the views choose.
     """
     matched, proposals, offset = [], [], 0
-    for look in looks:
-        own = look.proposals(cameras)
-        tables = [look.sure.masks.to("cpu")]
+    for each in passes:
+        own = each.proposals(cameras)
+        tables = [each.sure.masks.to("cpu")]
         if config.verify:
             with collect_warnings():  # said of the sure ones already
-                tables.append(look.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
-        numbered = [replace(each.regions, labels=each.regions.labels + offset) for each in tables]
-        matched += [replace(each, regions=regions) for each, regions in zip(tables, numbered, strict=True)]
+                tables.append(each.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
+        numbered = [replace(table.regions, labels=table.regions.labels + offset) for table in tables]
+        matched += [replace(table, regions=regions) for table, regions in zip(tables, numbered, strict=True)]
         proposals.append(own)
         offset += len(own)
     everything = proposals[0] if len(proposals) == 1 else Masks.concatenate(proposals)
@@ -166,6 +166,6 @@ def find_leaves(
                 min_probability=config.min_probability,
                 cache=cache,
             )
-    sides = cameras.sizes if looks[0].boxes is None else looks[0].boxes[:, 2:] - looks[0].boxes[:, :2]
-    pixel = int(sides.max()) / looks[0].longest
-    return Found(tuple(looks), leaves, everything, tuple(matched), looks[0].sure.report, pixel)
+    sides = cameras.sizes if passes[0].boxes is None else passes[0].boxes[:, 2:] - passes[0].boxes[:, :2]
+    pixel = int(sides.max()) / passes[0].longest
+    return PassResult(tuple(passes), leaves, everything, tuple(matched), passes[0].sure.report, pixel)

@@ -10,7 +10,7 @@ from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import Look, find_leaves
+from mvseg.detection.find_leaves import Pass, find_leaves
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
@@ -149,10 +149,10 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _said_of(self.match_detections(detections, cameras))
         config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
         posed = cameras.to("cpu")
-        look = Look.of(self, detections, posed, min_score=config.min_score)
-        leaves = find_leaves([look], posed, config=config).leaves
+        detected = Pass.of(self, detections, posed, min_score=config.min_score)
+        leaves = find_leaves([detected], posed, config=config).leaves
         missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
-        return _said_of(look.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
+        return _said_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:

@@ -50,13 +50,13 @@ def mask_photo(
     """A photo (H, W, 3) uint8 RGB with the instances of N masks (H, W) bool, which may overlap, and their N classes."""
     return LabelledPhoto(
         photo=_channels_first(photo),
-        layers=stack_masks(masks, ignore.shape),
+        layers=stack_layers(masks, ignore.shape),
         classes=torch.tensor(classes, dtype=torch.int64),
         ignore=torch.from_numpy(ignore),
     )
 
 
-def stack_masks(masks: Sequence[np.ndarray], size: tuple[int, ...]) -> Tensor:
+def stack_layers(masks: Sequence[np.ndarray], size: tuple[int, ...]) -> Tensor:
     """The layers of bool masks of this size (H, W): each instance goes into the first layer that is free there."""
     layers = [np.zeros(size, np.int32)]
     for number, mask in enumerate(masks, start=1):

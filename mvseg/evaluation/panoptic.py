@@ -50,7 +50,7 @@ class LeafMetrics:
 
 
 @dataclass(frozen=True)
-class Found:
+class SegmentMatches:
     """P estimated segments against T true ones.
 
     Attributes:
@@ -87,8 +87,8 @@ class Judged:
     instance: np.ndarray
     labels: tuple[int, ...]
     leaf_of_mask: tuple[int, ...]
-    masks: Found
-    leaves: Found
+    masks: SegmentMatches
+    leaves: SegmentMatches
 
 
 def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> LeafMetrics:
@@ -147,7 +147,7 @@ def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]
 
 def find_segments(
     regions: Regions, segments: np.ndarray, truth: Sequence[np.ndarray], *, numbers: Sequence[Mapping[int, int]]
-) -> Found:
+) -> SegmentMatches:
     """Which true segment each estimated one finds; of several that could, the one with the largest IoU does.
 
     Args:
@@ -174,7 +174,8 @@ def find_segments(
         best = int(iou[:, number].argmax())
         if iou[best, number] > RIGHT_IOU:
             finds[best], found_iou[best] = number, iou[best, number]
-    return Found(true_segment=finds, iou=found_iou, is_false=(finds < 0) & (sizes >= ignored), num_true=num_true)
+    is_false = (finds < 0) & (sizes >= ignored)
+    return SegmentMatches(true_segment=finds, iou=found_iou, is_false=is_false, num_true=num_true)
 
 
 def _count(labels: np.ndarray) -> Iterator[tuple[int, int]]:
@@ -193,7 +194,7 @@ def _covered_labels(
         yield segment, covered.cut(labels)[covered.pixels.cpu().numpy()]
 
 
-def count_shared_pairs(masks: Found, ids: np.ndarray, leaf: np.ndarray) -> tuple[int, int, int]:
+def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray) -> tuple[int, int, int]:
     """Pairs of masks that belong together.
 
     Args:

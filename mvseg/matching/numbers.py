@@ -79,7 +79,7 @@ class EMNumbers:
 
 
 @dataclass(frozen=True)
-class CostNumbers:
+class HypothesisCostNumbers:
     """What a view that does not show the cluster costs in a hypothesis, where one that shows it scores 1.
 
     These and the gains were chosen on development plants (`benchmarks/matching.py --split dev`); a search for better
@@ -122,7 +122,7 @@ class PieceNumbers:
 
 
 @dataclass(frozen=True)
-class SearchNumbers:
+class ClusterSearchNumbers:
     """The search for the best clusters."""
 
     max_sweeps: int = 3  # limit: sweeps; one more or less changes no id on degraded masks of 8 to 32 leaves
@@ -145,7 +145,7 @@ class NViewNumbers:
 
 
 @dataclass(frozen=True)
-class DoubtNumbers:
+class DisagreementNumbers:
     """When a matching is warned of; no id depends on it.
 
     Of 80 development scenes with exact poses and right ids one is warned of: its detector finds a third of the leaves
@@ -162,9 +162,9 @@ ONE_PER_VIEW = OnePerViewNumbers()
 SYMNMF = SymnmfNumbers()
 SWEEP = SweepNumbers()
 EM = EMNumbers()
-COSTS = CostNumbers()
+COSTS = HypothesisCostNumbers()
 GAINS = GainNumbers()
 PIECES = PieceNumbers()
-SEARCH = SearchNumbers()
+SEARCH = ClusterSearchNumbers()
 NVIEW = NViewNumbers()
-DOUBTS = DoubtNumbers()
+DOUBTS = DisagreementNumbers()

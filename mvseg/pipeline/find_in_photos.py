@@ -13,7 +13,7 @@ from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
-from mvseg.detection.find_leaves import Found, Look, find_leaves
+from mvseg.detection.find_leaves import PassResult, find_leaves
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
@@ -35,39 +35,39 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     """
     detect = opened.config.detect
     if detect.image_size is not None or not opened.is_chosen:
-        return know(opened, look_once(opened, detect, cache=cache))
-    few, views = _thin(opened)
-    first = look_once(few, detect, cache=cache)
-    boxes = first.looks[0].boxes
+        return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
+    few, views = _select_judges(opened)
+    first = run_pass(few, detect, cache=cache)
+    boxes = first.passes[0].boxes
 
-    def see(size: int) -> Found:
-        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=boxes)
+    def see(size: int) -> PassResult:
+        return run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes)
 
     found = choose_size(see, first)
     if few is opened:
-        return know(opened, found[0])
+        return plant_of_pass(opened, found[0])
     if boxes is not None:
-        masks, cameras = first.looks[0].sure.masks, opened.scene.cameras
+        masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
-    sizes = [None if each is first else each.looks[0].longest for each in found]
-    return know(opened, _look_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
+    sizes = [None if each is first else each.passes[0].longest for each in found]
+    return plant_of_pass(opened, _run_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
 
 
-def _look_in_all(
+def _run_in_all(
     opened: Opened,
     sizes: Sequence[int | None],
     detect: DetectConfig,
     *,
     cache: CachedDetections | None,
     boxes: Tensor | None,
-) -> Found:
+) -> PassResult:
     """What all views find at that one of the sizes where their agreed area is largest; None is the detector's own."""
-    seen = [look_once(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
+    seen = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
     return max(seen, key=lambda each: each.agreed_area)
 
 
-def _thin(opened: Opened) -> tuple[Opened, Tensor]:
+def _select_judges(opened: Opened) -> tuple[Opened, Tensor]:
     """The scene with the views that choose the size, and their indices (S,)."""
     cameras, most = opened.scene.cameras, DETECTION.judging_views
     if len(cameras) < 2 * most:
@@ -77,61 +77,59 @@ def _thin(opened: Opened) -> tuple[Opened, Tensor]:
     return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
 
 
-def look_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | None) -> Found:
-    """What weights find that have learned at the size of this look: there, or at the size next to it where the
-    views agree better, see `choose_near`; there alone where a size is given."""
+def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | None) -> PassResult:
+    """Run taught weights at the size that they have learned at, and at the sizes next to it, see `choose_near`; only at
+    `DetectConfig.image_size`, where it is given."""
     opened, boxes = plant.opened, plant.boxes
-    few, views = _thin(opened)
+    few, views = _select_judges(opened)
     if detect.image_size is not None:
-        return look_once(opened, detect, cache=cache, boxes=boxes)
+        return run_pass(opened, detect, cache=cache, boxes=boxes)
 
-    def see(size: int) -> Found:
-        return look_once(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views])
+    def see(size: int) -> PassResult:
+        return run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views])
 
     found = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
         return found[0]
-    return _look_in_all(opened, [each.looks[0].longest for each in found], detect, cache=cache, boxes=boxes)
+    return _run_in_all(opened, [each.passes[0].longest for each in found], detect, cache=cache, boxes=boxes)
 
 
-def look_once(
+def run_pass(
     opened: Opened,
     detect: DetectConfig,
     *,
     cache: CachedDetections | None,
     boxes: Tensor | None = None,
-) -> Found:
-    """What one look finds, with its warnings in it: it may be thrown away.
+) -> PassResult:
+    """Run the detector once over all views; the result holds its warnings, as it may be thrown away.
 
     Args:
         detect: which detector, and at which size.
     """
-    with collect_warnings() as said:
-        look = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        found = _choose(opened, look, detect)
-    return replace(found, said=tuple(said))
+    with collect_warnings() as findings:
+        detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
+        cameras, splits = opened.scene.cameras, opened.is_cut
+        result = find_leaves([detected], cameras, config=detect, splits=splits, cache=opened.surfaces)
+    return replace(result, findings=tuple(findings))
 
 
-def _choose(opened: Opened, look: Look, detect: DetectConfig) -> Found:
-    return find_leaves([look], opened.scene.cameras, config=detect, splits=opened.is_cut, cache=opened.surfaces)
-
-
-def know(opened: Opened, found: Found) -> Plant:
-    """What is known once a look is chosen; warns of what there is to say of it."""
-    for finding in found.said:
+def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
+    """Make a plant of the pass that was selected; warn of its findings."""
+    for finding in result.findings:
         warn(finding)
-    if not len(found.looks[0].sure):
+    detected = result.passes[0]
+    if not len(detected.sure):
         warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
-    matching = Matching(found.matched[0], found.report)
+    matching = Matching(result.matched[0], result.report)
     plant = Plant(
         opened=opened,
         matching=matching,
         instances=Instances(),
-        proposals=found.proposals,
-        matched=found.matched,
-        image_size=found.looks[0].longest,
-        boxes=whole_photos(opened.scene) if found.looks[0].boxes is None else found.looks[0].boxes,
+        proposals=result.proposals,
+        matched=result.matched,
+        image_size=detected.longest,
+        boxes=whole_photos(opened.scene) if detected.boxes is None else detected.boxes,
         left=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return plant.with_leaves(found.leaves) if opened.is_chosen else plant
+    return plant.with_leaves(result.leaves) if opened.is_chosen else plant

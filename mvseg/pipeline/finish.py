@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
-from mvseg.corrections.settle import settle
+from mvseg.corrections.settle import settle_edits
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding, Values, keep_causes
@@ -63,7 +63,7 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
     shapes = opened.config.reconstruct
     surfaces = None if shapes is None or shapes.shape == "voxels" else fit_leaves(plant, same_segmenter)
     shown = surfaces or plant.instances.starts
-    left, fates = settle(plant.edits, plant.refused, plant.left, shown, cameras=plant.scene.cameras)
+    left, fates = settle_edits(plant.edits, plant.refused, plant.left, shown, cameras=plant.scene.cameras)
     for fate in fates:
         if fate.finding is not None:
             warn(fate.finding)

@@ -25,7 +25,7 @@ from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import know, look_near
+from mvseg.pipeline.find_in_photos import plant_of_pass, run_near
 from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
@@ -48,7 +48,7 @@ def learn(
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
     A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
-    learn these (`fine_tune`); the detector looks again, at the same size and at those next to it (`look_near`); the
+    learn these (`fine_tune`); the detector looks again, at the same size and at those next to it (`run_near`); the
     views choose. The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end
     when it grows by less than `GROWTH`. Ctrl-C ends them, too, and what was there stays.
 
@@ -121,9 +121,9 @@ def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Pl
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
-    found = look_near(plant, detect, cache=cache)
+    found = run_near(plant, detect, cache=cache)
     with collect_warnings():
-        seen = know(opened, found)
+        seen = plant_of_pass(opened, found)
     return replace(seen, learned=Learned(weights=_at_size(path, seen.image_size)))
 
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.corrections.corrected import Fate, Refused
+from mvseg.corrections.corrected import Fate, RejectedPixel
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.match import match_masks
@@ -62,7 +62,7 @@ class Plant:
     left: tuple[LeftOut, ...]
     agreement: float = float("nan")
     edits: tuple[Fate, ...] = ()
-    refused: tuple[Refused, ...] = ()
+    refused: tuple[RejectedPixel, ...] = ()
     learned: Learned = NOTHING_LEARNED
     disagreement: Finding | None = None
 

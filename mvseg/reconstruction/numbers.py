@@ -168,7 +168,7 @@ class SearchNumbers:
 
 
 @dataclass(frozen=True)
-class DoubtNumbers:
+class QualityNumbers:
     """When a surface is doubted."""
 
     least_iou: float = 0.8  # chosen: median IoU below which it is
@@ -319,7 +319,7 @@ FIT = FitNumbers()
 IMAGE = ImageNumbers()
 OUTLINE = OutlineNumbers()
 SEARCH = SearchNumbers()
-DOUBTS = DoubtNumbers()
+DOUBTS = QualityNumbers()
 ERRORS = ErrorNumbers()
 STEM = StemNumbers()
 TUBE = TubeNumbers()

@@ -36,7 +36,7 @@ def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int,
     return process.returncode, said
 
 
-class Opened(Protocol):
+class OpenFolder(Protocol):
     """A folder that the user corrects: a result, or tracks.
 
     Attributes:
@@ -95,7 +95,7 @@ class Update:
     messages: list[str]
 
 
-Kind = TypeVar("Kind", bound=Opened)
+Kind = TypeVar("Kind", bound=OpenFolder)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from mvseg.server.saved_edits import CORRECTIONS_FILE
 from mvseg.system.running import Cancelled
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.numbers import PAGE
-from mvseg.tracking.page import build_page, describe_tracks
+from mvseg.tracking.page import build_tracks_page, describe_tracks
 from mvseg.tracking.questions import Question, describe_changes, list_questions
 from mvseg.tracking.recorded import PlantResults, RecordedTracks, find_plant_links, read_recorded_tracks
 from mvseg.tracking.track import Tracks, track_leaves
@@ -74,7 +74,7 @@ class OpenTracks:
             "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
             "revision": name_edits(corrections.edits),
         }  # fmt: skip
-        return build_page(self.plant.plant, self._shown.data | {"correct": correct})
+        return build_tracks_page(self.plant.plant, self._shown.data | {"correct": correct})
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         """The tracks with these edits; then, what the answers to each question would change.

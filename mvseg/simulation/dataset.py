@@ -92,7 +92,7 @@ class SceneSpec:
     seed: int
 
 
-def list_scenes(preset: Preset, seed: int) -> list[SceneSpec]:
+def list_specs(preset: Preset, seed: int) -> list[SceneSpec]:
     """Every scene of the data set, in a fixed order."""
     scenes = []
     for split, num_plants in preset.plants:
@@ -140,8 +140,8 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     with lock_folder(folder):
-        claim_folder(folder, recipe=json.dumps({"preset": asdict(preset), "seed": seed}, indent=1))
-        write_scenes(folder, preset, list_scenes(preset, seed), num_workers=num_workers)
+        claim_dataset(folder, recipe=json.dumps({"preset": asdict(preset), "seed": seed}, indent=1))
+        write_scenes(folder, preset, list_specs(preset, seed), num_workers=num_workers)
 
 
 def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_workers: int) -> None:
@@ -157,7 +157,7 @@ def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_w
     write_table(folder / "scenes.csv", columns, [tuple(asdict(scene).values()) for scene in scenes])
 
 
-def claim_folder(folder: Path, *, recipe: str) -> None:
+def claim_dataset(folder: Path, *, recipe: str) -> None:
     """Make an empty folder that of a data set, or go on with the one that it holds, minus what a killed run left
     unfinished."""
     made_from = folder / "dataset.json"

@@ -49,7 +49,7 @@ class SimulatedPlant:
 
 
 @dataclass(frozen=True, eq=False)
-class Node:
+class StemNode:
     """Where a frond sits on a stem: point (3,), azimuth, age from 0 (youngest) to 1, size factor."""
 
     point: Floats
@@ -126,7 +126,7 @@ def split_into_fronds(num_leaves: int, family: Family, rng: np.random.Generator)
 
 
 def place_frond(
-    node: Node, family: Family, rng: np.random.Generator, *, num_blades: int, pot: Pot, others: list[Frond]
+    node: StemNode, family: Family, rng: np.random.Generator, *, num_blades: int, pot: Pot, others: list[Frond]
 ) -> Frond:
     """The least crowded of a few random poses, lifted off the soil."""
     taken = cKDTree(np.concatenate([FAR_AWAY, *(other.points for other in others)]))
@@ -144,7 +144,7 @@ def lift_frond(frond: Frond, pot: Pot) -> Frond:
     return replace(frond, rachis=lift(pot, frond.rachis), blades=tuple(lift(pot, blade) for blade in frond.blades))
 
 
-def grow_frond(node: Node, family: Family, rng: np.random.Generator, *, num_blades: int) -> Frond:
+def grow_frond(node: StemNode, family: Family, rng: np.random.Generator, *, num_blades: int) -> Frond:
     """A frond in a random pose: a rachis with one blade at its end and the others, leaflets, in pairs along it."""
     azimuth = node.azimuth + math.radians(rng.normal(0, 12))
     young, old = family.elevation
@@ -171,7 +171,7 @@ def grow_frond(node: Node, family: Family, rng: np.random.Generator, *, num_blad
 # --- shoots
 
 
-def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tuple[list[Floats], list[Node]]:
+def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tuple[list[Floats], list[StemNode]]:
     """Stems as (n, 3) points, and one node for every frond, shoot by shoot from the lowest to the top.
 
     Further shoots come out of the lower nodes of the first one (branches) or out of the soil around it (tillers).
@@ -179,7 +179,7 @@ def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tu
     shares = np.array_split(np.arange(num_fronds), math.ceil(num_fronds / family.per_shoot))
     is_tillering = rng.random() < family.tillers
     stems: list[Floats] = []
-    nodes: list[Node] = []
+    nodes: list[StemNode] = []
     start = rng.uniform(0, 2 * np.pi)
     for index, share in enumerate(shares):
         azimuth = start + index * GOLDEN_ANGLE
@@ -188,24 +188,24 @@ def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tu
         else:
             parent = nodes[(2 * (index - 1)) % max(len(shares[0]) // 2, 1)]
             azimuth, tilt = parent.azimuth + rng.normal(0, 0.3), math.radians(rng.uniform(35, 50))
-            foot = Node(point=parent.point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.7, 0.85))
+            foot = StemNode(point=parent.point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.7, 0.85))
         stem, shoot_nodes = grow_shoot(foot, family, rng, tilt=tilt, num_fronds=len(share))
         stems.append(stem)
         nodes += shoot_nodes
     return stems, nodes
 
 
-def place_foot(family: Family, rng: np.random.Generator, *, azimuth: float, is_first: bool) -> tuple[Node, float]:
+def place_foot(family: Family, rng: np.random.Generator, *, azimuth: float, is_first: bool) -> tuple[StemNode, float]:
     """Where a shoot comes out of the soil, the first one in the middle, and its tilt."""
     out = rng.uniform(0.2, 0.45) * family.pot_radius * (not is_first)
     point = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
     tilt = math.radians(rng.uniform(*family.lean) + 6 * (not is_first))
-    return Node(point=point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.85, 1.1)), tilt
+    return StemNode(point=point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.85, 1.1)), tilt
 
 
 def grow_shoot(
-    foot: Node, family: Family, rng: np.random.Generator, *, tilt: float, num_fronds: int
-) -> tuple[Floats, list[Node]]:
+    foot: StemNode, family: Family, rng: np.random.Generator, *, tilt: float, num_fronds: int
+) -> tuple[Floats, list[StemNode]]:
     """One stem that leaves `foot` tilted from the vertical and turns upwards, and a node for each frond on it."""
     levels = math.ceil(num_fronds / family.per_node)
     ages = ((levels - np.arange(levels)) / levels) ** 0.7
@@ -219,5 +219,5 @@ def grow_shoot(
     for index in range(num_fronds):
         level, at_level = divmod(index, family.per_node)
         azimuth = turn + math.radians(family.divergence * level + 360 * at_level / family.per_node)
-        nodes.append(Node(point=stem[3 * level + 3], azimuth=azimuth, age=float(ages[level]), scale=foot.scale))
+        nodes.append(StemNode(point=stem[3 * level + 3], azimuth=azimuth, age=float(ages[level]), scale=foot.scale))
     return stem, nodes

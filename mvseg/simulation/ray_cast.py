@@ -89,7 +89,7 @@ def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
     def look(px: Doubles) -> tuple[Floats, NDArray[np.int32], Floats]:
         x, y, z = world_from_px.T
         rays = (px[:, :1] * x + px[:, 1:] * y + z).astype(np.float32)  # depth 1 along +z; no BLAS, whose sums may vary
-        return trace(stage, np.tile(center, (len(rays), 1)), rays, rng=rng)
+        return trace_rays(stage, np.tile(center, (len(rays), 1)), rays, rng=rng)
 
     color, face, depth = look(centres)
     hit = face >= 0
@@ -103,7 +103,7 @@ def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
     return Rendering(rgb, ids, depth.reshape(height, width))
 
 
-def trace(
+def trace_rays(
     stage: Stage, origins: Floats, rays: Floats, *, rng: np.random.Generator
 ) -> tuple[Floats, NDArray[np.int32], Floats]:
     """Radiance (n, 3), face (n,) (-1 for none) and depth (n,) seen along rays (n, 3), whose length is a depth of 1."""

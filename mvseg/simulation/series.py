@@ -27,8 +27,8 @@ from mvseg.simulation.growth import (
     GOLDEN_ANGLE,
     POSES_TRIED,
     Frond,
-    Node,
     SimulatedPlant,
+    StemNode,
     crowding,
     grow_frond,
     lift_frond,
@@ -127,7 +127,7 @@ class GrowingPlant:
 
     spec: SeriesSpec
     pot: Pot
-    shoots: tuple[tuple[Node, Floats, float], ...]  # foot, (levels,) full gaps, tilt
+    shoots: tuple[tuple[StemNode, Floats, float], ...]  # foot, (levels,) full gaps, tilt
     seats: tuple[_Seat, ...]
 
     def at(self, day: float, *, is_wilted: bool = False) -> SimulatedPlant:
@@ -163,7 +163,7 @@ class GrowingPlant:
         azimuth = seat.azimuth + math.radians(4) * math.sin(2 * day + 3 * sway[0])
         age = float(np.clip(size + 0.05 * math.sin(3 * day + 3 * sway[1]), 0, 1))
         scale = seat.scale * size / (0.4 + 0.6 * age)
-        node = Node(point=stem[3 * seat.level + 3], azimuth=azimuth, age=age, scale=scale)
+        node = StemNode(point=stem[3 * seat.level + 3], azimuth=azimuth, age=age, scale=scale)
         frond = grow_frond(node, family, np.random.default_rng(seat.seed), num_blades=len(seat.ids))
         return lift_frond(frond, self.pot)
 
@@ -184,7 +184,7 @@ def plan_plant(spec: SeriesSpec) -> GrowingPlant:
 
 
 def _seat_fronds(
-    spec: SeriesSpec, counts: Sequence[int], shoots: Sequence[tuple[Node, Floats, float]], rng: np.random.Generator
+    spec: SeriesSpec, counts: Sequence[int], shoots: Sequence[tuple[StemNode, Floats, float]], rng: np.random.Generator
 ) -> list[_Seat]:
     """Fronds from the oldest to the youngest; shoots take turns, level by level."""
     family = FAMILIES[spec.family]

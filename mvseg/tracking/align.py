@@ -118,7 +118,7 @@ def list_poses(pair: Pair) -> Poses:
     found: list[Alignment] = [_as_it_stood(pair)]
     left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
     while len(left) and len(found) < ALIGN.num_refined:
-        found.append(refine(pair, poses[left[0]]))
+        found.append(refine_alignment(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
     every = np.stack([each.pose for each in found])
     gains = np.array([each.gain - large_new(pair, each.pairs) for each in found])
@@ -234,7 +234,7 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
     return np.concatenate(found)
 
 
-def refine(pair: Pair, pose: Floats) -> Alignment:
+def refine_alignment(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
     pairs = np.zeros((0, 2), int)
     for _ in range(ALIGN.rounds):

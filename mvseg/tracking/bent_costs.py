@@ -14,7 +14,7 @@ import numpy as np
 from mvseg.tracking.align import Alignment
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
-from mvseg.tracking.leaves import Leaves, Pair
+from mvseg.tracking.leaves import DateLeaves, Pair
 from mvseg.tracking.numbers import COSTS
 
 
@@ -24,7 +24,7 @@ def bent_costs(pair: Pair, alignment: Alignment) -> Floats:
     return fitted_costs(replace(pair, first=bent), LINKS, widths)
 
 
-def bend(pair: Pair, alignment: Alignment) -> tuple[Leaves, Floats]:
+def bend(pair: Pair, alignment: Alignment) -> tuple[DateLeaves, Floats]:
     """The leaves of the earlier date where the later one should show them, and (N,) factors of the scales of places.
 
     The shift of a base is linear in its place: a ridge regression over the pairs, `COSTS.prior_pairs` strong, of which

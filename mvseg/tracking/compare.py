@@ -16,18 +16,18 @@ from mvseg.tracking.align import (
     list_poses,
     pose_distances,
     pose_gain,
-    refine,
+    refine_alignment,
 )
 from mvseg.tracking.bent_costs import bent_costs
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
-from mvseg.tracking.leaves import Leaves, Pair
+from mvseg.tracking.leaves import DateLeaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
-Sight = tuple[int, int]  # index of the date, row of its `Leaves`
+Sight = tuple[int, int]  # index of the date, row of its `DateLeaves`
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,7 @@ class Comparison:
 
 
 def compare_dates(
-    dates: Sequence[Leaves],
+    dates: Sequence[DateLeaves],
     times: Sequence[float],
     *,
     knows_up: bool,
@@ -84,7 +84,7 @@ def compare_dates(
     motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
         pair, pose = pairs[earlier, later], step_between(poses, (earlier, later))
-        alignment = refine(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
+        alignment = refine_alignment(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
         trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.pose, habit)
         if not len(alignment.pairs):
             continue
@@ -130,7 +130,7 @@ def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
     parted[rows], parted[:, columns] = np.maximum(parted[rows], none), np.maximum(parted[:, columns], none)
     if motion.is_sure:
         part = pair.take(rows, columns)
-        alignment = refine(part, motion.pose)
+        alignment = refine_alignment(part, motion.pose)
         if len(alignment.pairs):
             parted[np.ix_(rows, columns)] = bent_costs(part, alignment)
     return parted

@@ -12,7 +12,7 @@ from mvseg.tracking.numbers import COSTS, SIGHTS
 
 
 @dataclass(frozen=True, eq=False)
-class Leaves:
+class DateLeaves:
     """N leaves with a shape, as arrays, in one frame.
 
     Attributes:
@@ -50,11 +50,11 @@ class Leaves:
         ahead = self.midribs[:, -1] - self.midribs[:, 0]
         return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
-    def take(self, rows: np.ndarray) -> Leaves:
+    def take(self, rows: np.ndarray) -> DateLeaves:
         """Some of the leaves."""
-        return Leaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+        return DateLeaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
-    def moved(self, pose: Floats) -> Leaves:
+    def moved(self, pose: Floats) -> DateLeaves:
         """In another frame, by its pose (4, 4)."""
         rotation, shift = pose[:3, :3], pose[:3, 3]
         return replace(
@@ -64,12 +64,12 @@ class Leaves:
             points=self.points @ rotation.T + shift,
         )
 
-    def shifted(self, shifts: Floats) -> Leaves:
+    def shifted(self, shifts: Floats) -> DateLeaves:
         """Each leaf by its own of the shifts (N, 3)."""
         return replace(self, midribs=self.midribs + shifts[:, None], points=self.points + shifts[:, None])
 
 
-def leaves_of(date: PlantOnDate) -> Leaves:
+def leaves_of(date: PlantOnDate) -> DateLeaves:
     """The leaves of a date that have a shape."""
     shaped: Sequence[SeenLeaf] = [date.leaves[index] for index in date.shaped]
 
@@ -77,7 +77,7 @@ def leaves_of(date: PlantOnDate) -> Leaves:
         number = leaf.numbers.get(trait)
         return number.sd if number is not None and np.isfinite(number.sd) else 0.0
 
-    return Leaves(
+    return DateLeaves(
         index=np.array(date.shaped, int),
         midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, SIGHTS.stations, 3),
         normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
@@ -103,15 +103,17 @@ class Pair:
         said: (N, M) what a person says of two leaves, as a cost: below 0 they are one, above 0 they are not.
     """
 
-    first: Leaves
-    second: Leaves
+    first: DateLeaves
+    second: DateLeaves
     days: float
     knows_up: bool
     scale: float
     said: Floats
 
     @classmethod
-    def of(cls, first: Leaves, second: Leaves, *, days: float, knows_up: bool, said: Floats | None = None) -> Pair:
+    def of(
+        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, said: Floats | None = None
+    ) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
         found = [1e-9]

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.tracking.align import alikeness, best_pairs, draw_poses, pose_distances, refine
+from mvseg.tracking.align import alikeness, best_pairs, draw_poses, pose_distances, refine_alignment
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import Pair
@@ -55,7 +55,7 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
             break
         at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
         left = left[pose_distances(pair, at, poses[left]) >= 1]
-        refined = refine(pair.take(own, np.arange(len(pair.second))), at)
+        refined = refine_alignment(pair.take(own, np.arange(len(pair.second))), at)
         if pose_distances(pair, pose, refined.pose[None])[0] >= 1:
             others = fitted_costs(pair.moved(refined.pose), LINKS)
             rows, columns = best_pairs(np.minimum(costs, others)).T

@@ -32,11 +32,11 @@ def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    page = build_page(tracks.plant, describe_tracks(tracks, growth))
+    page = build_tracks_page(tracks.plant, describe_tracks(tracks, growth))
     (folder / PAGE_FILE).write_text(page, encoding="utf-8", newline="\n")
 
 
-def build_page(plant: str, data: Mapping[str, Any]) -> str:
+def build_tracks_page(plant: str, data: Mapping[str, Any]) -> str:
     """The page; `data` of `describe_tracks`, with "correct" where `mvseg correct` serves it: {"edits", "revision", and
     what else its script reads}."""
     is_served = "correct" in data

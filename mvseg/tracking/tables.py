@@ -28,7 +28,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
+def write_track_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
     """Write the tables of one plant; `nodes.csv` has a row per date and node."""
     rows: dict[str, list[tuple[Cell, ...]]] = {name: [] for name in COLUMNS}
 

@@ -22,7 +22,7 @@ from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import Bools, Ints, paint_view, see
 from mvseg.verification.numbers import AGAIN, PARTS
-from mvseg.verification.shown_leaves import Question, ask, settle
+from mvseg.verification.shown_leaves import MaskQuestion, ask, settle_masks
 
 
 def check_ids(
@@ -55,7 +55,7 @@ def check_ids(
     if masks.regions.num_views < AGAIN.least_views:
         is_held = is_held | (on_cpu.match_scores >= SURE).numpy()
     question = ask(on_cpu, surfaces, cameras=cameras, config=config, is_held=is_held, cache=cache)
-    leaf, odds = settle(question)
+    leaf, odds = settle_masks(question)
     names = on_cpu.instance_ids[on_cpu.instance_ids > 0].unique().numpy()
     num_new = len(question.candidates) - len(names)
     names = np.concatenate((names, on_cpu.num_instances + 1 + np.arange(num_new), [-1]))
@@ -70,7 +70,7 @@ def check_ids(
 
 
 def find_shared(
-    question: Question, leaf: Ints, names: Ints, *, cameras: Cameras, pairs: Set[tuple[int, int, int]] = frozenset()
+    question: MaskQuestion, leaf: Ints, names: Ints, *, cameras: Cameras, pairs: Set[tuple[int, int, int]] = frozenset()
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 

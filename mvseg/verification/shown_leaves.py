@@ -33,7 +33,7 @@ class GivenScores:
     """`python -m benchmarks.checked_ids --fit` fits them.
 
     Attributes:
-        shows: log odds that a mask shows a candidate are the sum of `shows_features` times these, in their order.
+        shows: log odds that a mask shows a candidate are the sum of `given_features` times these, in their order.
         price: log odds that masks must gain in all by a leaf that the first matching does not know.
     """
 
@@ -51,7 +51,7 @@ GIVEN = GivenScores(
 
 
 @dataclass(frozen=True, eq=False)
-class Question:
+class MaskQuestion:
     """Which of K candidates does each of D given masks show?
 
     Attributes:
@@ -77,14 +77,14 @@ class Question:
         is_held: Bools,
         more: Sequence[Masks] = (),
         cache: SurfaceCache | None = None,
-    ) -> Question:
+    ) -> MaskQuestion:
         """About the instances of masks with their surfaces, and those of `more`, the same masks with other ids."""
         found = [(each, torch.arange(len(masks))) for each in (masks, *more)]
         held = torch.from_numpy(is_held)
         candidates = gather_candidates(found, cameras, table=masks, is_held=held, surfaces=surfaces, cache=cache)
         ids = masks.instance_ids.numpy()
         names = np.unique(ids[ids > 0])
-        return Question(
+        return MaskQuestion(
             masks=masks,
             candidates=candidates,
             leaf=np.where(ids > 0, np.searchsorted(names, ids), -1),
@@ -102,15 +102,15 @@ def ask(
     is_held: Bools,
     fitted: GivenScores = GIVEN,
     cache: SurfaceCache | None = None,
-) -> Question:
+) -> MaskQuestion:
     """What to ask of D matched masks on the CPU, also of the instances that the matcher finds once more."""
-    first = Question.of(masks, surfaces, cameras, is_held=is_held)
+    first = MaskQuestion.of(masks, surfaces, cameras, is_held=is_held)
     odds = show_odds(first, fitted)[np.arange(len(masks)), first.leaf]
     more = match_again(masks, first.leaf, odds=odds, cameras=cameras, config=config)
-    return Question.of(masks, surfaces, cameras, is_held=is_held, more=more, cache=cache) if more else first
+    return MaskQuestion.of(masks, surfaces, cameras, is_held=is_held, more=more, cache=cache) if more else first
 
 
-def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
+def show_odds(question: MaskQuestion, fitted: GivenScores = GIVEN) -> Floats:
     """(D, K + 1) log odds that each mask shows each candidate, and 0, of none; inf where that is held, -inf where it
     cannot.
 
@@ -119,7 +119,7 @@ def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
     """
     candidates, masks = question.candidates, question.masks
     evidence = see(question.drawn, len(masks), question.is_known & candidates.is_credible)
-    odds = np.round(shows_features(candidates, evidence) @ list(fitted.shows.values()), CHOICE.digits)
+    odds = np.round(given_features(candidates, evidence) @ list(fitted.shows.values()), CHOICE.digits)
     is_near = ~np.isnan(candidates.matched) | (candidates.is_credible & (evidence.claimed > 0))
     odds[~is_near | ~same_class(candidates, masks)] = -np.inf
     is_apart = masks.is_linked.numpy() & (question.leaf < 0)  # the user only says which leaf they do not show
@@ -128,7 +128,7 @@ def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
     return np.column_stack((odds, np.zeros(len(masks))))
 
 
-def shows_features(candidates: Candidates, evidence: Evidence) -> Floats:
+def given_features(candidates: Candidates, evidence: Evidence) -> Floats:
     """(D, K, 7). Of a credible surface, 0 for others: 1; the log odds of the match score, 0 where a mask was matched to
     another candidate; whether it was; and the log odds of `Evidence.visible` and `within`. Of a candidate without: 1,
     and the log odds of the match score.
@@ -141,7 +141,7 @@ def shows_features(candidates: Candidates, evidence: Evidence) -> Floats:
     return np.stack((*by_surface, ones * ~has_shape, score * ~has_shape), 2)
 
 
-def assign(question: Question, odds: Floats, is_open: Bools) -> tuple[Ints, Floats]:
+def assign(question: MaskQuestion, odds: Floats, is_open: Bools) -> tuple[Ints, Floats]:
     """(D,) the candidate that each mask shows, -1 for none, and (D,) the log odds that it does.
 
     That of the largest log odds, but none for which they are negative, nor one that another mask of the view was
@@ -164,7 +164,7 @@ def assign(question: Question, odds: Floats, is_open: Bools) -> tuple[Ints, Floa
     return np.where(moves, best, leaf), np.where(moves, elsewhere[every, best], own)
 
 
-def settle(question: Question, fitted: GivenScores = GIVEN) -> tuple[Ints, Floats]:
+def settle_masks(question: MaskQuestion, fitted: GivenScores = GIVEN) -> tuple[Ints, Floats]:
     """The assignment to the leaves of the first matching, and to others that are worth their price, the one that gains
     most first."""
     odds, is_open = show_odds(question, fitted), question.is_known.copy()
@@ -180,7 +180,7 @@ def settle(question: Question, fitted: GivenScores = GIVEN) -> tuple[Ints, Float
         is_open[leaf] = True
 
 
-def gained(question: Question, before: tuple[Ints, Floats], after: tuple[Ints, Floats], leaf: int) -> float:
+def gained(question: MaskQuestion, before: tuple[Ints, Floats], after: tuple[Ints, Floats], leaf: int) -> float:
     """Log odds that the masks gain in all by a leaf; 0 if fewer than `CHOICE.least_views` show it."""
     is_other = before[0] != after[0]
     if len(np.unique(question.masks.view_index.numpy()[after[0] == leaf])) < CHOICE.least_views:

@@ -18,7 +18,7 @@ from mvseg.checks.epipolar_distances import (
     fundamental,
     scale_focal,
 )
-from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair, match_photos, neighbours
+from mvseg.checks.photo_matches import PhotoMatches, find_photo_features, match_pair, match_photos, neighbours
 from mvseg.errors import InputError
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
@@ -113,7 +113,7 @@ def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], photos: Pho
 
 def test_plain_photos_tell_nothing(demo_scene: Scene) -> None:
     black = np.zeros((480, 640, 3), np.uint8)
-    assert len(find_features(black)) == 0
+    assert len(find_photo_features(black)) == 0
     shared = match_photos(lambda _: black, demo_scene.cameras)
     assert not any(pair.is_significant for pair in shared)
     assert say(shared, scale_focal(demo_scene.cameras, 0.5)) == []

@@ -13,7 +13,7 @@ import torch
 from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
-from mvseg.corrections.settle import settle
+from mvseg.corrections.settle import settle_edits
 from mvseg.findings.finding import Finding
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
@@ -269,12 +269,12 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
         at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
     )
     assert fates(corrected) == ["points at nothing"] * 3
-    left, final = settle(corrected.fates, corrected.refused, (candidate, other), {}, cameras=SCENE.cameras)
+    left, final = settle_edits(corrected.fates, corrected.refused, (candidate, other), {}, cameras=SCENE.cameras)
     answered = replace(corrected, fates=final)
     assert left == (other,)
     assert fates(answered) == ["applied", "points at nothing", "applied"]
     assert len(findings_of(answered)) == 1
-    assert settle(final, answered.refused, left, {}, cameras=SCENE.cameras)[0] == (other,)
+    assert settle_edits(final, answered.refused, left, {}, cameras=SCENE.cameras)[0] == (other,)
 
 
 def test_links_stay_with_their_masks_when_an_instance_goes() -> None:

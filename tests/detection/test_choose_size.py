@@ -42,7 +42,7 @@ def look_of(masks: Masks, longest: int = 32) -> Any:
 
 def expecting(right: float, longest: int = 800, agreement: float = 0.9) -> Any:
     leaves = SimpleNamespace(agreement=agreement)
-    return SimpleNamespace(agreed_area=right, leaves=leaves, looks=(SimpleNamespace(longest=longest),))
+    return SimpleNamespace(agreed_area=right, leaves=leaves, passes=(SimpleNamespace(longest=longest),))
 
 
 @pytest.mark.parametrize(
@@ -96,7 +96,7 @@ def test_the_sizes_next_to_the_one_that_was_learned(
         looks.append(size)
         return expecting(areas[size], size)
 
-    assert choose_near(see, asked[0], most=most)[0].looks[0].longest == best
+    assert choose_near(see, asked[0], most=most)[0].passes[0].longest == best
     assert looks == asked
 
 

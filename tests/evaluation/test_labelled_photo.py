@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.evaluation.labelled_photo import label_photo, mask_photo, stack_masks
+from mvseg.evaluation.labelled_photo import label_photo, mask_photo, stack_layers
 from mvseg.regions import IGNORE_LABEL
 
 HEIGHT, WIDTH = 12, 16
@@ -36,7 +36,7 @@ def test_a_map_of_one_number(label: int, count: int) -> None:
 
 
 def test_instances_share_layers_where_they_can() -> None:
-    layers = stack_masks([SQUARE, BAR, CORNER], (HEIGHT, WIDTH))
+    layers = stack_layers([SQUARE, BAR, CORNER], (HEIGHT, WIDTH))
     assert [layer.unique().tolist() for layer in layers] == [[0, 1, 3], [0, 2]]
     for number, mask in enumerate((SQUARE, BAR, CORNER), start=1):
         np.testing.assert_array_equal((layers == number).any(0), mask)

@@ -28,7 +28,7 @@ from mvseg.matching.nview.plane_sweep import (
     sweep_dilated,
     sweep_planes,
 )
-from mvseg.matching.nview.search import refine, search
+from mvseg.matching.nview.search import refine_clusters, search
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.partition import Clusters
 from mvseg.matching.result import Matching
@@ -374,7 +374,7 @@ def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
 
 def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene, scores: ClusterScores) -> None:
     truth = Clusters.of(balls.regions.labels.numpy())
-    np.testing.assert_array_equal(refine(scores, truth).ids, truth.ids)
+    np.testing.assert_array_equal(refine_clusters(scores, truth).ids, truth.ids)
     partition = search(scores, Clusters.of(np.arange(len(truth.ids))))
     np.testing.assert_array_equal(search(scores, truth).ids, truth.ids)
     assert scores.value(partition) >= scores.value(truth) - 1e-6

@@ -8,7 +8,7 @@ import pytest
 
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
 from mvseg.reconstruction.numbers import STACK
-from mvseg.reconstruction.surface.hull import carve_hull, look_at
+from mvseg.reconstruction.surface.hull import carve_hull, locate_points
 from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.mask_stack import MaskStack, choose_pixel_size, stack_masks
 
@@ -55,9 +55,9 @@ def test_what_another_instance_may_hide_is_not_free() -> None:
     masks = stack(3)
     hidden = replace(masks, others=np.where(masks.inside, 0, 7).astype(np.int32))
     points = carve_hull(masks).points
-    inside, free = look_at(masks, points)
+    inside, free = locate_points(masks, points)
     assert (inside | free).all()
-    assert not look_at(hidden, points)[1].any()
+    assert not locate_points(hidden, points)[1].any()
 
 
 def test_masks_without_a_common_point_have_no_hull() -> None:

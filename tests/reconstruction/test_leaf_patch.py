@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_grid,
     patch_prior,
 )
-from mvseg.reconstruction.surface.orientation import base_distances, mirror_matrix, stem_distances, turn_matrix
+from mvseg.reconstruction.surface.orientation import base_distances, mirror_matrix, reversal_matrix, stem_distances
 from mvseg.reconstruction.surface.patch_start import start_patches
 
 
@@ -93,7 +93,7 @@ def test_prior_does_not_depend_on_the_turn_of_the_world() -> None:
 def test_turned_and_mirrored_patches_are_the_same_surface() -> None:
     coefficients, grid = wavy_patch(), patch_grid(12, 5)
     points = grid.points(coefficients)
-    assert grid.points(turn_matrix() @ coefficients) == pytest.approx(points[::-1, ::-1], abs=1e-12)
+    assert grid.points(reversal_matrix() @ coefficients) == pytest.approx(points[::-1, ::-1], abs=1e-12)
     assert grid.points(mirror_matrix() @ coefficients) == pytest.approx(points[:, ::-1], abs=1e-12)
 
 

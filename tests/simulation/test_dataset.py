@@ -16,7 +16,7 @@ from pycocotools.coco import COCO
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.simulation import dataset
-from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_scenes, plant_index, write_dataset
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_specs, plant_index, write_dataset
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.system.atomic import lock_folder
@@ -130,7 +130,7 @@ def test_list_of_scenes_names_every_folder(tiny: Path) -> None:
 
 
 def test_paper_eval_has_every_cell_in_both_splits() -> None:
-    scenes = list_scenes(PRESETS["paper-eval"], seed=0)
+    scenes = list_specs(PRESETS["paper-eval"], seed=0)
     for split, num_plants in (("dev", 3), ("test", 6)):
         for num_leaves in (4, 8, 16, 32):
             for num_views in (3, 5, 10, 20):
@@ -144,7 +144,7 @@ def test_paper_eval_has_every_cell_in_both_splits() -> None:
 
 
 def test_train_is_large_and_has_all_families() -> None:
-    scenes = [scene for scene in list_scenes(PRESETS["train"], seed=0) if scene.split == "train"]
+    scenes = [scene for scene in list_specs(PRESETS["train"], seed=0) if scene.split == "train"]
     assert len({scene.seed for scene in scenes}) >= 200
     assert sum(scene.num_views for scene in scenes) >= 6000
     assert {scene.family for scene in scenes} == set(FAMILIES) - {"fern"}  # only plants rendered during training
@@ -153,7 +153,7 @@ def test_train_is_large_and_has_all_families() -> None:
 
 
 def test_wild_scenes_show_wild_plants(tmp_path: Path) -> None:
-    scenes = list_scenes(PRESETS["wild"], seed=0)
+    scenes = list_specs(PRESETS["wild"], seed=0)
     assert len(scenes) == 108
     assert {scene.family for scene in scenes if scene.split == "train"} == set(FAMILIES) - {"fern"}
     small = replace(PRESETS["wild"], plants=(("train", 1),), leaves=(2,), views=(2,), size=(48, 48))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvseg.tracking.align import Alignment, best_pairs, refine
+from mvseg.tracking.align import Alignment, best_pairs, refine_alignment
 from mvseg.tracking.bent_costs import bend, bent_costs
 from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, fitted_costs, size_costs
 from mvseg.tracking.leaves import Pair, leaves_of
@@ -46,7 +46,7 @@ def test_a_plant_that_leans_over_is_bent_before_its_leaves_are_compared() -> Non
     blades = grow_blades(9, 3)
     leaning = {leaf: blade + (blade[0, 1, 2], 0.4 * blade[0, 1, 2], 0) for leaf, blade in blades.items()}
     pair, there = pair_of(blades, leaning)
-    alignment = refine(pair, np.eye(4))
+    alignment = refine_alignment(pair, np.eye(4))
     bent, straight = bent_costs(pair, alignment), fitted_costs(pair.moved(alignment.pose), LINKS)
     rows = np.arange(9)
     assert bent[rows, there].max() < straight[rows, there].max() - 2

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.align import make_poses
-from mvseg.tracking.leaves import Leaves, Pair, leaves_of
+from mvseg.tracking.leaves import DateLeaves, Pair, leaves_of
 from mvseg.tracking.motions import Motion, find_motion
 from tests.plants_over_days import Blades, grow_blades, grown, see
 
@@ -53,5 +53,5 @@ def test_some_of_the_leaves_are_taken() -> None:
     leaves = leaves_of(see(grow_blades(5, 1), 0)[0])
     some = leaves.take(np.array([3, 1]))
     assert len(some) == 2
-    for field in fields(Leaves):
+    for field in fields(DateLeaves):
         np.testing.assert_array_equal(getattr(some, field.name), getattr(leaves, field.name)[[3, 1]])

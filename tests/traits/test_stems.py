@@ -107,10 +107,10 @@ def test_a_turned_and_scaled_world_has_the_same_nodes(seed: int) -> None:
 
 
 def test_a_leaf_that_was_taken_the_wrong_way_round_is_turned() -> None:
-    from mvseg.reconstruction.surface.orientation import _transform, turn_matrix
+    from mvseg.reconstruction.surface.orientation import _transform, reversal_matrix
 
     leaves = dict(PLANTS["spiral"][1])
-    leaves[1] = _transform(leaves[1], turn_matrix())
+    leaves[1] = _transform(leaves[1], reversal_matrix())
     (stem,) = stems_of(leaves)
     assert len(stem.nodes) == 8
     (axis,) = axes_of_bases(leaves, UP)

@@ -17,7 +17,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.shown_leaves import GIVEN, Question, ask, assign, settle, show_odds
+from mvseg.verification.shown_leaves import GIVEN, MaskQuestion, ask, assign, settle_masks, show_odds
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 SURFACES = {1: LEAVES[1], 3: LEAVES[3]}
@@ -39,8 +39,8 @@ def unsure(regions: Regions, ids: Tensor, rows: Tensor) -> Masks:
     return matched(regions, ids, torch.where(rows, 0.5, 0.95)).masks
 
 
-def question_of(masks: Masks, surfaces: dict[int, LeafSurface]) -> Question:
-    return Question.of(masks, surfaces, CAMERAS, is_held=np.zeros(len(masks), bool))
+def question_of(masks: Masks, surfaces: dict[int, LeafSurface]) -> MaskQuestion:
+    return MaskQuestion.of(masks, surfaces, CAMERAS, is_held=np.zeros(len(masks), bool))
 
 
 def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions, Tensor, Tensor]) -> None:
@@ -77,8 +77,8 @@ def test_a_leaf_that_is_not_worth_its_price_is_not_there(scattered: tuple[Region
     nothing = np.zeros(len(masks), bool)
     question = ask(masks, SURFACES, cameras=CAMERAS, config=MatchConfig(), is_held=nothing)
     assert question.is_known.tolist() == [True, True, False]
-    assert (settle(question)[0] == 2).tolist() == (leaves == 2).tolist()
-    assert (settle(question, replace(GIVEN, price=1000.0))[0] == question.leaf).all()
+    assert (settle_masks(question)[0] == 2).tolist() == (leaves == 2).tolist()
+    assert (settle_masks(question, replace(GIVEN, price=1000.0))[0] == question.leaf).all()
 
 
 def test_a_mask_joins_the_leaf_that_it_shows_or_stays() -> None:

@@ -39,7 +39,7 @@ def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[C
     """
     refined = []
     for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
-        refined.append(refine(scores, refine(scores, start), join_fragments=True))
+        refined.append(refine_clusters(scores, refine_clusters(scores, start), join_fragments=True))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
     if max(values) - values[0] > (1 - SEARCH.as_good) * abs(max(values)):
@@ -48,7 +48,7 @@ def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[C
     return join_few(scores, best)
 
 
-def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False) -> Clusters:
+def refine_clusters(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False) -> Clusters:
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:

@@ -71,7 +71,7 @@ def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
     used = np.zeros(len(before), np.int64)
     joined = [leaf for leaf, index in graph.leaf_index.items() if before[index] >= 0]
     for leaf in joined:
-        used[trace(before, graph.leaf_index[leaf])] += 1
+        used[trace_path(before, graph.leaf_index[leaf])] += 1
     num = len(joined) + 1
     cells = used[: len(before) - len(graph.leaf_index)]
     return np.asarray(np.maximum(np.minimum(cells, num - cells), 1) - 1)
@@ -136,13 +136,13 @@ def _find_petioles(
     found = {}
     for leaf, index in graph.leaf_index.items():
         if np.isfinite(cost[index]):
-            way = [place for place in trace(before, index) if place < len(cells.points)]
+            way = [place for place in trace_path(before, index) if place < len(cells.points)]
             end = leaves[leaf][cKDTree(leaves[leaf]).query(cells.points[way[-1]])[1]]
             found[leaf] = np.concatenate([cells.points[way], end[None]])
     return found
 
 
-def trace(before: NDArray, end: int) -> list[int]:
+def trace_path(before: NDArray, end: int) -> list[int]:
     """Places from a source of `dijkstra` to an end."""
     way = [end]
     while before[way[-1]] >= 0:

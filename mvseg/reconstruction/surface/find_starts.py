@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mvseg.reconstruction.numbers import FIT, SEARCH
 from mvseg.reconstruction.spread_views import spread_directions
 from mvseg.reconstruction.surface.fit_patch import FIRST_HALF, SECOND_HALF, approach_patches
-from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
+from mvseg.reconstruction.surface.hull import Hull, carve_hull, locate_points
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import measure_sizes
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks
@@ -176,7 +176,7 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
 
     None where fewer than three would be left.
     """
-    inside, free = look_at(masks, points)
+    inside, free = locate_points(masks, points)
     shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
     is_wrong = shares < SEARCH.wrong_share * np.median(shares)
     return is_wrong if (~is_wrong).sum() >= 3 else np.zeros(len(masks), bool)

@@ -49,14 +49,14 @@ def carve_hull(masks: MaskStack) -> Hull:
             break
     cells = cells.divide(max(1, round((HULL.num_voxels / max(len(cells), 1)) ** (1 / 3))))
     voxels, corner, size = cells.indices.numpy(), cells.corner.numpy(), cells.size
-    inside, free = look_at(masks, corner + size * (voxels + 0.5))
+    inside, free = locate_points(masks, corner + size * (voxels + 0.5))
     votes = inside.sum(0)
     is_shown = votes > HULL.shown_share * len(masks)
     is_seen = votes > HULL.seen_share * (votes + free.sum(0)) + 1e-6
     return Hull(voxels=voxels[is_shown], is_seen=is_seen[is_shown], corner=corner, size=size)
 
 
-def look_at(masks: MaskStack, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def locate_points(masks: MaskStack, points: Floats) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(S, P) bool, is a point (P, 3) in the mask of a view, and does that view show nothing where it is?"""
     image = project_points(masks.px_from_world, points[None])
     stack = np.repeat(np.arange(len(masks)), len(points))

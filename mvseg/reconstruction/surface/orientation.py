@@ -18,7 +18,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
 
-def turn_matrix() -> Floats:
+def reversal_matrix() -> Floats:
     """(26, 26): of coefficients to those of the same surface from its other end (u -> 1 - u, v -> -v). Normals stay."""
     starts = np.cumsum((0, *COUNTS))
     order = np.concatenate([np.arange(first, last)[::-1] for first, last in pairwise(starts)])
@@ -44,7 +44,7 @@ def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[
     for (instance, surface), (first, last) in zip(there.items(), distances, strict=True):
         is_clear = has_stem and abs(first - last) > STEM.clear * surface.length
         if last < first:
-            surface = _transform(surface, turn_matrix())
+            surface = _transform(surface, reversal_matrix())
         surface = replace(surface, is_oriented=bool(is_clear))
         towards = cameras.centers[surface.views].mean(0).cpu() - surface.midrib.mean(0)
         oriented[instance] = _transform(surface, mirror_matrix()) if towards @ surface.normal < 0 else surface
