@@ -1,7 +1,7 @@
 """Which mvseg this is: a version for people, and a hash of the code that tells whether a result was made by the same
 code.
 
-The version is the installation's, which the build takes from git. It says nothing of what was changed since in an
+The version is the installation's, which the build takes from git. It does not tell of changes since in an
 editable checkout, or of a source tree that was never installed; the hash covers both.
 """
 
@@ -36,5 +36,5 @@ def code_hash(package: Path = PACKAGE) -> str:
 
 
 def made_by() -> dict[str, str]:
-    """What a result says of the mvseg that made it."""
+    """Entry of run.json about the mvseg that made a result."""
     return {"mvseg": __version__, "code": code_hash()}

@@ -42,7 +42,7 @@ class Crop:
         return x1 <= x < x2 and y1 <= y < y2 and bool(self.pixels[y - y1, x - x1])
 
     def cut(self, frame: Frame) -> Frame:
-        """(h, w, ...) a view of what a frame (H, W, ...) holds in the box, which must lie inside."""
+        """(h, w, ...) view of a frame (H, W, ...) in the box, which must lie inside."""
         x1, y1, x2, y2 = self.box
         return frame[y1:y2, x1:x2]
 
@@ -67,13 +67,13 @@ class Crop:
         return Crop(box, self.pixels[top : bottom + 1, left : right + 1])
 
     def union(self, *others: Crop) -> Crop:
-        """What the mask or one of the others covers, in the box around all."""
+        """Union of the mask and others, in the box around all."""
         x1, y1, x2, y2 = zip(*(each.box for each in (self, *others)), strict=True)
         box = min(x1), min(y1), max(x2), max(y2)
         return Crop(box, torch.stack([each.within(box).pixels for each in (self, *others)]).any(0))
 
     def intersect(self, other: Crop) -> Crop:
-        """What both masks cover, in the box of this one."""
+        """Intersection of both masks, in the box of this one."""
         return Crop(self.box, self.pixels & other.within(self.box).pixels)
 
     def iou(self, other: Crop) -> float:

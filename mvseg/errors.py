@@ -85,7 +85,7 @@ def note_warnings() -> Iterator[list[Finding]]:
 
 
 def say_fault(error: OSError | MemoryError) -> str:
-    """What the system refuses, in words: a folder that cannot be made, a full disk, more memory."""
+    """Reason why the system refuses, in words: a folder that cannot be made, a full disk, more memory."""
     if isinstance(error, MemoryError):
         return f"there is not enough memory ({str(error) or 'no more is known'})"
     return f"{error.filename}: {error.strerror}" if error.filename else str(error)

@@ -32,14 +32,14 @@ COLUMNS = (  # that are tensors
 
 
 class Origin(IntEnum):
-    """Where a mask comes from."""
+    """Source of a mask."""
 
     GIVEN = 0  # the user's
     DETECTED = 1
     OTHER_VIEWS = 2  # no detector found it: surfaces fitted to the masks of other views show it
-    CORRECTED = 3  # a person drew it; from here on, no stage changes or drops a mask
-    CUT = 4  # a person cut it from another one
-    CONFIRMED = 5  # a person says that it is right, with the edge that photos give it
+    CORRECTED = 3  # the user drew it; from here on, no stage changes or drops a mask
+    CUT = 4  # the user cut it from another one
+    CONFIRMED = 5  # the user says that it is right, with the edge that photos give it
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Masks:
         detection_scores: (D,) float32, the detector's; NaN for masks that no detector scored.
         classes: (D,) int64; masks of different classes are never matched.
         origin: (D,) int64, of `Origin`.
-        is_linked: (D,) bool, a person says which other masks show its instance, or do not.
+        is_linked: (D,) bool, the user says which other masks show its instance, or do not.
         second_ids: (D,) int64, id of the second instance that a mask seems to show; -1 for none.
         second_parts: D times (h, w) bool on the CPU, the pixels of the mask's box that show it; None for none.
 
@@ -131,7 +131,7 @@ class Masks:
 
     @property
     def is_corrected(self) -> Tensor:
-        """(D,) bool: a person drew, cut or confirmed it."""
+        """(D,) bool: the user drew, cut or confirmed it."""
         return self.origin >= Origin.CORRECTED
 
     @property
@@ -198,7 +198,7 @@ class Masks:
         return self.relabel(numbers)
 
     def renumber(self, of_instances: Mapping[int, T]) -> dict[int, T]:
-        """What is known by the ids that masks have, by those that `close_gaps` gives them."""
+        """Rename keys from ids of masks to the ids that `close_gaps` gives them."""
         used = self.instance_ids[self.instance_ids > 0].unique().tolist()
         return {new: of_instances[old] for new, old in enumerate(used, start=1) if old in of_instances}
 

@@ -131,7 +131,7 @@ class Regions:
         return [index for index in near if self.crop(index)[y - int(y1[index]), x - int(x1[index])]]
 
     def union(self, indices: Iterable[int]) -> Crop:
-        """What one or more regions of one view cover."""
+        """Union of one or more regions of one view."""
         first, *others = map(self.placed, indices)
         return first.union(*others)
 

@@ -164,7 +164,7 @@ def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
 
 
 def camera_problem(K: Tensor, R: Tensor, t: Tensor, *, size: Tensor) -> str | None:
-    """What is wrong with one camera, as the end of a sentence; None for a sound one. Shapes as in `Cameras`."""
+    """Fault of one camera, as the end of a sentence; None for a sound one. Shapes as in `Cameras`."""
     for name, value in (("K", K), ("R", R), ("t", t)):
         if not torch.isfinite(value).all():
             return f"{name} holds a number that is not finite"

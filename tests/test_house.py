@@ -136,6 +136,27 @@ def test_nobody_is_he() -> None:
     assert {path.name for path in pages if re.search(r"\b(he|his|him)\b", path.read_text("utf-8"))} == set()
 
 
+def test_sentences_have_a_noun_or_a_verb_at_their_head() -> None:
+    """And none hangs on "of what", "of those that" or "of these that"; the user is "the user"."""
+    phrases = re.compile(r"\bof what\b|\bof those that\b|\bof these that\b|\ba\s+person\b", re.IGNORECASE)
+    assert {module for module, source in MODULES.items() if phrases.search(source)} == set()
+    heads = re.compile(r"(?:what|which|where|that|of|those|these)\b", re.IGNORECASE)
+    public = [(module, node.name) for module, source in MODULES.items() for node in ast.walk(ast.parse(source))
+              if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_")
+              and heads.match(ast.get_docstring(node) or "")]  # fmt: skip
+    assert public == []
+
+
+def test_public_names_are_given_once() -> None:
+    """But for verbs of the command line, which have the same functions."""
+    places: dict[str, list[str]] = {}
+    for module, source in MODULES.items():
+        for node in ast.parse(source).body if room_of(module) != "cli" else ():
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(module)
+    assert {name: of for name, of in places.items() if len(of) > 1} == {}
+
+
 def test_no_two_modules_need_each_other() -> None:
     """Inside of rooms, too, and for types alone; `__init__` of a room takes from its modules, which is no circle."""
     imports = {module: imported_modules(source, module) & MODULES.keys() for module, source in MODULES.items()}
@@ -230,19 +251,12 @@ def test_numbers_of_a_room_stand_in_one_place() -> None:
 WORDS = "definition", "limit", "fitted", "insensitive", "chosen"
 
 
-def is_number(value: ast.expr | None) -> bool:
-    """Whether an expression is made of numbers alone."""
-    if isinstance(value, ast.Constant):
-        return type(value.value) in (int, float)
-    parts = [each for each in ast.iter_child_nodes(value) if isinstance(each, ast.expr)] if value is not None else []
-    kinds = ast.UnaryOp | ast.BinOp | ast.Tuple | ast.List
-    return isinstance(value, kinds) and bool(parts) and all(map(is_number, parts))
-
-
 def words_of_numbers(source: str, *, fields: bool = False) -> dict[str, str]:
     """{name: comment} of the numbers of a module, in the line or right above it; `fields` are those of classes."""
     lines, tree = source.splitlines(), ast.parse(source)
-    nodes = [node for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign) and is_number(node.value)]
+    plain = re.compile(r"(?=.*\d)[-+*/(),. \d<e]+")
+    nodes = [node for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign)
+             and node.value is not None and plain.fullmatch(ast.unparse(node.value))]  # fmt: skip
     if fields:
         nodes += [node for each in tree.body if isinstance(each, ast.ClassDef) for node in each.body
                   if isinstance(node, ast.AnnAssign) and node.value is not None]  # fmt: skip

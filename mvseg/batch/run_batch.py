@@ -172,7 +172,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
 
 
 def _replace_teachers(waiting: Mapping[int, BatchScene]) -> dict[int, BatchScene]:
-    """The same scenes, whose teachers have failed; the first of those that each had now teaches the others."""
+    """The same scenes, whose teachers have failed; the first scene of each now teaches the others."""
     first: dict[str | None, str] = {}
     for scene in waiting.values():
         if first.setdefault(scene.teacher, scene.name) == scene.name:

@@ -29,7 +29,7 @@ from mvseg.tracking.track import track_leaves
 
 @dataclass(frozen=True)
 class TrackedPlant:
-    """What is kept of a plant once its tables and pages are written: counts, warnings; a sentence if it failed."""
+    """Summary of a plant once its tables and pages are written: counts, warnings; a sentence if it failed."""
 
     dates: int = 0
     tracks: int = 0

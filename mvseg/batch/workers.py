@@ -48,7 +48,7 @@ class Lost:
 
 @contextmanager
 def open_workers(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """What does `work` on items: `run_on_dask` where there is a scheduler, else `run_locally`.
+    """Open workers that do `work` on items: `run_on_dask` where there is a scheduler, else `run_locally`.
 
     Raises:
         InputError: see `connect`.

@@ -30,7 +30,7 @@ OF_OTHER_PHOTOS = {"view_off": "masks_of_other_photo", "poses_disagree": "masks_
 
 @dataclass(frozen=True, eq=False)
 class Check:
-    """What the checks of a scene found.
+    """Outcome of the checks of a scene.
 
     Attributes:
         scene: that was checked.

@@ -69,7 +69,7 @@ class FeatureNumbers:
     fewest: int = 20  # chosen: features that fit one fundamental matrix, at least; 40 with nothing in common give 13
     least_share: float = 0.5  # chosen: the same, as a share of all features that have moved
     offset: float = 1.5  # chosen: units that features of right cameras may miss their epipolar lines by
-    contradicts: float = 0.3  # chosen: share of these that fit the cameras', below which cameras are wrong
+    contradicts: float = 0.3  # chosen: share of features on the lines of the cameras, below which these are wrong
     agrees: float = 0.6  # chosen: the same, above which they agree
     fewest_pairs: int = 3  # chosen: pairs of photos that judge a focal length, at least
     least_error: float = 0.05  # chosen: change of its logarithm, at least

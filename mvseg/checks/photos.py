@@ -53,7 +53,7 @@ def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
 
 
 def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) -> list[Finding]:
-    """What is wrong with the photos of V views, by V entries; all may be missing where masks are given."""
+    """Findings about the photos of V views, by V entries; all may be missing where masks are given."""
     names = tuple(view.name for view in scene.views)
     missing = tuple(view for view, each in enumerate(facts) if each.size is None and not each.problem)
     rules: list[Rule] = []

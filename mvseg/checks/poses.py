@@ -100,7 +100,8 @@ def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
 
 
 def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
-    """Which views agree: the worst one that agrees with none is set apart, again and again, until the others agree.
+    """Find the views that agree: the worst one that agrees with none is set apart, again and again, until the others
+    agree.
 
     A view agrees with none if hardly more of its masks fit than by chance, and the lines miss in most other views. The
     rest must be more than half of the views, and at least two.

@@ -29,7 +29,7 @@ def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floa
             may lie partly outside; and (P, 2) pixels of the shape, all in the photo.
 
     Returns:
-        The labels of those that were found.
+        The labels of the shapes that were found.
     """
     height, width = photo.shape[:2]
     labels = np.zeros((height, width), np.uint16)

@@ -71,7 +71,7 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
     "categories": (str | None, None, "names of the categories of masks to take, as leaf,petiole (default: all)"),
     "up": (str | list[float] | None, None,
            "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the cameras'"),
-    "corrections": (Path | None, None, "file of a person's corrections, in the scene folder or anywhere; "
+    "corrections": (Path | None, None, "file of the user's corrections, in the scene folder or anywhere; "
                     "docs/corrections.md"),
     "force_corrections": (bool, False, "apply --corrections even if they were made for other photos"),
     "overwrite": (bool, False, "replace what mvseg wrote to --out even if it is another scene's, or no result"),
@@ -90,7 +90,7 @@ def add_shared(parser: ArgumentParser, *names: str) -> None:
 
 
 def read_workers(args: Namespace) -> int:
-    """What --num_workers says of work that --scheduler may take over; 1 by default."""
+    """Read --num_workers of work that --scheduler may take over; 1 by default."""
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
     return 1 if args.num_workers is None else int(args.num_workers)
@@ -159,7 +159,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_up(up: str | list[float] | None) -> Up | None:
-    """What --up says: three numbers, "rig", "board", or nothing.
+    """Read --up: three numbers, "rig", "board", or nothing.
 
     Raises:
         InputError: anything else.

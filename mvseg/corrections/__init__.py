@@ -1,1 +1,1 @@
-"""Reads what a person says is wrong, applies it to the masks of a scene, and ranks what else is worth asking about."""
+"""Reads what the user says is wrong, applies it to the masks of a scene, and ranks what else is worth asking about."""

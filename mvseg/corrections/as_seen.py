@@ -21,7 +21,7 @@ def name_each(regions: Regions) -> list[str]:
 
 
 def seen_ids(masks: Masks, before: Masks) -> Tensor:
-    """(D,) int64, the ids that a person saw: those of the same masks before edits; -1 for those that were not there."""
+    """(D,) int64, the ids that the user saw: those of the same masks before edits; -1 for those that were not there."""
     known = dict(zip(name_each(before.regions), before.instance_ids.tolist(), strict=True))
     return torch.tensor([known.get(name, -1) for name in name_each(masks.regions)], dtype=torch.int64)
 
@@ -33,7 +33,7 @@ def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
     Args:
         corrected: D masks and their links.
         ids: (D,) int64, their `seen_ids`.
-        before: the masks before the edits, on the CPU, with the ids that the person saw.
+        before: the masks before the edits, on the CPU, with the ids that the user saw.
 
     Returns:
         (L,) int64, their ids in `before`.
@@ -56,12 +56,12 @@ def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
 
 def leave_joined(seen: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
     """The leaves that stay as they were `seen` (D,), without those that other masks join: at least half of the masks of
-    such a leaf are matched to one that a person speaks of, and that is of no such leaf.
+    such a leaf are matched to one that the user speaks of, and that is of no such leaf.
 
     Args:
         seen: (D,) int64, their ids; -1 for all other masks.
         matched_ids: (D,) int64, the ids of the masks matched anew.
-        is_held: (D,) bool, the masks that a person speaks of.
+        is_held: (D,) bool, the masks that the user speaks of.
     """
     is_other = is_held & (seen < 1) & (matched_ids > 0)
     is_joined = torch.isin(matched_ids, matched_ids[is_other])

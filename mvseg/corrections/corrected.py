@@ -16,7 +16,7 @@ APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contra
 
 @dataclass(frozen=True)
 class Fate:
-    """What came of an edit: its number from 1 on, its operation, and "applied", "points at nothing", "contradicted by
+    """Outcome of an edit: its number from 1 on, its operation, and "applied", "points at nothing", "contradicted by
     edit N" or, of links between dates, "not of a scene"; `problem` says which place it was, or why."""
 
     edit: int
@@ -35,7 +35,7 @@ class Fate:
 
 @dataclass(frozen=True)
 class RejectedPixel:
-    """A pixel where a person says that no leaf is, and where no mask is: it may be the answer to a question, see
+    """A pixel where the user says that no leaf is, and where no mask is: it may be the answer to a question, see
     `settle`.
 
     Attributes:
@@ -62,14 +62,14 @@ class Whole:
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
-    """Masks as edits leave them.
+    """Masks after all edits.
 
     Attributes:
         masks: D masks on the CPU, by view, matched to nothing.
         links: of their rows; those that no edit names keep outlines apart from what else their photos show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: the edits about whole instances.
-        refused: the pixels where a person says that no leaf is, and where no mask is.
+        refused: the pixels where the user says that no leaf is, and where no mask is.
         fates: of the edits, in their order.
     """
 

@@ -1,4 +1,4 @@
-"""The queue of a person who corrects a result: the answers that are expected to change most come first."""
+"""The queue of the user who corrects a result: the answers that are expected to change most come first."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Outlines = tuple[tuple[int, NDArray[np.float64]], ...]
 
 @dataclass(frozen=True, eq=False)
 class Doubt:
-    """One question to a person.
+    """One question to the user.
 
     Attributes:
         kind: "place": large places have the colour of leaves, and no mask: are there leaves? "half": does a leaf have
@@ -49,7 +49,7 @@ class Doubt:
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
         found, expected: number of views that have a mask of the leaf, and that should; of "half", those that have half
             a mask, and that have any.
-        size: area of what it is about, as a share of that of a usual mask, at most 1.
+        size: area of its place, relative to a usual mask, at most 1.
         outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
             "missing", two or more of "leaf", those of "place" and "half", none of the others.
     """
@@ -79,9 +79,9 @@ def list_doubts(
     left: Sequence[LeftOut] = (),
     photos: ReadPhoto | None = None,
 ) -> list[Doubt]:
-    """What a person should look at, at most `DOUBTS.most`: first places without masks and half masks, then what an
-    answer is expected to change most (`Doubt.change`); masks that a person made or confirmed are not asked about, and
-    every other mask once.
+    """List places that the user should look at, at most `DOUBTS.most`: first places without masks and half masks, then
+    what an answer is expected to change most (`Doubt.change`); masks that the user made or confirmed are not asked
+    about, and every other mask once.
 
     Args:
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.

@@ -1,4 +1,4 @@
-"""The file of corrections: what a person says is wrong, photo by photo; see docs/corrections.md.
+"""The file of corrections: what the user says is wrong, photo by photo; see docs/corrections.md.
 
 An edit names things by points, in pixels of the photo as the user has it (with its distortion, the centre of the
 top-left pixel at 0.5, 0.5), never by numbers of a result: numbers change with every run, points do not.
@@ -94,7 +94,7 @@ Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(di
 
 
 class PhotoMark(BaseModel):
-    """What tells a photo from others: its size, pixels, and the SHA-256 of its file; None for masks without a photo."""
+    """Identity of a photo: its size, pixels, and the SHA-256 of its file; None for masks without a photo."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
     width: Pixels

@@ -1,4 +1,4 @@
-"""A person who says that two halves show one leaf says so of all photos. Not in the paper.
+"""The user who says that two halves show one leaf says so of all photos. Not in the paper.
 
 Where masks show a leaf in two halves in many photos, each half is an instance of its own. A link would join the two
 linked masks, and leave the others to either half.
@@ -35,10 +35,10 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
 
     Args:
         corrected: D masks and their links.
-        before: the masks before the edits, on the CPU, with the ids that the person saw.
+        before: the masks before the edits, on the CPU, with the ids that the user saw.
 
     Returns:
-        The same with more links; a link that would contradict those of the person is left out.
+        The same with more links; a link that would contradict those of the user is left out.
     """
     masks, links = corrected.masks, corrected.links
     if not len(links.must):

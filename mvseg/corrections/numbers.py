@@ -1,6 +1,6 @@
 """The numbers of corrections: definitions, technical limits, and thresholds that only sort and propose.
 
-`python benchmarks/corrections.py` measures what the page's questions and a person's own edits gain with them.
+`python benchmarks/corrections.py` measures what the page's questions and the user's own edits gain with them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EditNumbers:
-    """What a file of corrections may hold, which masks an edit is about, and how a rough outline is refined."""
+    """Limits of a file of corrections, masks that an edit is about, and rough outlines."""
 
     most_bytes: int = 64 * 2**20  # limit: size of the file, at most
     most_edits: int = 10_000  # limit: edits of a file, and photos that it names, at most
@@ -34,11 +34,11 @@ class EditNumbers:
 
 @dataclass(frozen=True)
 class QuestionNumbers:
-    """What a person is asked, also of places that have the colour of leaves and no mask. Doubts only sort questions."""
+    """Questions to the user, also about leaf-coloured places without a mask. Doubts only sort questions."""
 
     least: float = 0.3  # chosen: doubt from which a question is asked
-    most: int = 200  # limit: questions of a page, at most: it asks a few itself, and the others where a person clicks
-    digits: int = 6  # limit: decimals of what an answer changes; what differs in later ones is a tie
+    most: int = 200  # limit: questions of a page, at most: it asks a few itself, and the others where the user clicks
+    digits: int = 6  # limit: decimals of the change by an answer; later ones make a tie
     as_good: float = 0.1  # chosen: match score below the best from which masks are as good; the largest is shown
     lone: float = 0.6  # chosen: doubt of a mask that was matched to nothing, at most
     missing: float = 0.8  # chosen: doubt where a mask is missing, at most

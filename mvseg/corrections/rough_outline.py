@@ -16,7 +16,7 @@ Points = NDArray[np.float64]
 
 
 def refine_outline(photo: NDArray[np.uint8], rough: Points) -> Points:
-    """The outline of what lies inside a rough one.
+    """Refine a rough outline.
 
     Args:
         photo: (H, W, 3) uint8 RGB.

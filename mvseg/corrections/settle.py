@@ -1,4 +1,4 @@
-"""Edits that point at no mask, once all is known that a person may be asked about."""
+"""Edits that point at no mask, once all is known that the user may be asked about."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def settle_edits(
     *,
     cameras: Cameras,
 ) -> tuple[tuple[LeftOut, ...], tuple[Fate, ...]]:
-    """The edits that say "no leaf" where no mask is, once all is known that a person may be asked about.
+    """The edits that say "no leaf" where no mask is, once all is known that the user may be asked about.
 
     They are applied where they answer a question: a candidate that was not chosen is shown there, which goes if the
     edit is about all photos, or a surface, of which no mask is there.

@@ -1,4 +1,4 @@
-"""What a person says of leaves on different dates, from a file of corrections."""
+"""What the user says of leaves on different dates, from a file of corrections."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mvseg.formats.label_png import read_labels
 
 @dataclass(frozen=True)
 class LeafLink:
-    """What a person says of leaves: `leaves` are (scene, leaf) pairs, all of one leaf, or of different ones."""
+    """Link of the user between leaves: `leaves` are (scene, leaf) pairs, all of one leaf, or of different ones."""
 
     is_same: bool
     leaves: tuple[tuple[str, int], ...]

@@ -1,4 +1,4 @@
-"""Parts of the photos that have the colour of leaves and no mask: what was missed there, only a person can say."""
+"""Parts of the photos that have the colour of leaves and no mask: what was missed there, only the user can say."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Unmasked:
 
 def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list[Unmasked]:
     """The parts of at least `least_area` pixels, by view; none where nothing is matched, whose colours tell what leaves
-    look like. What is long and thin like a stem is left out. Of what is very large, or reaches the edge of the photo,
-    its widest place counts: several leaves hang together there, or the ground.
+    look like. What is long and thin like a stem is left out. Of a very large part, or one that reaches the edge of the
+    photo, its widest place counts: several leaves hang together there, or the ground.
 
     Args:
         masks: D masks on the CPU, matched.

@@ -31,7 +31,7 @@ FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 @dataclass(frozen=True, eq=False)
 class CachedDetections:
-    """Where the detections of a run are cached.
+    """Cache of the detections of a run.
 
     Attributes:
         folder: of the files; made with the first of them.
@@ -74,7 +74,8 @@ def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
 
 
 def read_detections(path: Path) -> dict[str, Tensor] | None:
-    """What `write_detections` wrote, the same bits; None where there is nothing, or something else."""
+    """Read detections as `write_detections` wrote them, the same bits; None where there is nothing, or something
+    else."""
     try:
         detections = safetensors.torch.load(path.read_bytes())
     except (OSError, safetensors.SafetensorError):

@@ -52,7 +52,7 @@ def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> li
 
 
 def order_sizes(looked: Sequence[PassResult]) -> list[PassResult]:
-    """What was found where the agreed area is largest; of equals, what comes first. And at the next best size, if some
+    """Passes by their agreed area: the best one; of equals, the first. And the next best one, if some
     of the views cannot tell the two apart (`DETECTION.as_good`): then all of them should."""
     ordered = sorted(looked, key=lambda each: -each.agreed_area)
     return [each for each in ordered[:2] if each.agreed_area >= DETECTION.as_good * ordered[0].agreed_area]

@@ -91,6 +91,6 @@ def crop_cameras(cameras: Cameras, boxes: Tensor) -> Cameras:
 
 
 def place_crops(masks: Masks, boxes: Tensor) -> Masks:
-    """What was found in crops of the photos, (V, 4) int64 xyxy, in the frame of the photos."""
+    """Place masks of crops (V, 4) int64 xyxy in the frames of the photos."""
     offset = boxes[masks.view_index, :2].repeat(1, 2)
     return replace(masks, regions=replace(masks.regions, boxes=masks.regions.boxes + offset))

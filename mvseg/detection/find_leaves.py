@@ -44,7 +44,7 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Pass:
-    """What a detector proposes in V photos, or in parts of them, seen at one size.
+    """Proposals of a detector in V photos, or in parts of them, seen at one size.
 
     Attributes:
         model: that proposed it, and matches it.
@@ -83,8 +83,8 @@ class Pass:
         return masks if self.boxes is None else place_crops(masks, self.boxes)
 
     def match(self, cameras: Cameras, min_score: float) -> Matching:
-        """Those that score `min_score` or more, matched with the V cameras of the photos, in their frames; `labels` are
-        rows of `proposals`. The reprojection error is that of `sure`: the poses are the same."""
+        """Match proposals that score `min_score` or more with the V cameras of the photos, in their frames; `labels`
+        are rows of `proposals`. The reprojection error is that of `sure`: the poses are the same."""
         with timed("match"):
             matching = self.model.match_detections(
                 self.detections,

@@ -173,7 +173,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         min_score: float = 0.0,
         residual_px: int | None = None,
     ) -> Matching:
-        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
+        """The second half of `find_regions`: match the output of `detect` for V images, of proposals
         that score `min_score` or more. `labels` of its regions are rows of the excessive set, view after view.
         `residual_px`: see `match_proposals`."""
         matching = self._match(detections, cameras.to("cpu"), min_score=min_score, residual_px=residual_px)
@@ -232,7 +232,7 @@ def _said_of(matching: Matching) -> Matching:
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:
-    """torchvision's result dicts of what the other views leave, best score first."""
+    """torchvision's result dicts of matched masks, best score first."""
     results = []
     for view, (width, height) in enumerate(sizes):
         shown = masks.select(masks.view_index == view)

@@ -45,7 +45,7 @@ def backed_by_views(
     match_scores: Tensor,
     iou_threshold: float = 0.3,
 ) -> Tensor:
-    """Which boxes stay: those that no better box overlaps, and those that the other views show to be another
+    """Test which boxes stay: those that no better box overlaps, and those that the other views show to be another
     instance, by another id with a match score of at least 0.5.
 
     Cluster-aware NMS keeps a duplicate as well as a half-hidden leaf when it takes another cluster than the better box.

@@ -23,7 +23,7 @@ class DetectionNumbers:
     brightest: float = 1.5  # limit: pixel value above which photos are not in [0, 1]; resampling may exceed 1
     # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
     sure_score: float = 0.3  # insensitive: score of the proposals that are matched first, at least
-    more_score: float = 0.1  # chosen: score of those that are matched for more candidates, at least
+    more_score: float = 0.1  # chosen: score of proposals that are matched for more candidates, at least
     least_score: float = 0.05  # definition: score of the whole excessive set, at least: torchvision's threshold
     most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
     mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most

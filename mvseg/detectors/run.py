@@ -29,7 +29,7 @@ def run_heads(
     nms_thresh: float | None = None,
     detections_per_img: int | None = None,
 ) -> dict[str, Tensor]:
-    """What a detector finds in one photo, before anything is scaled back to the photo.
+    """Run the heads of a detector on one photo, before anything is scaled back to the photo.
 
     Under autocast the backbone may work in half precision; the coordinates of boxes may not, so that everything behind
     it runs in the precision of the heads' weights.
@@ -75,7 +75,7 @@ def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:
 
 
 def detect(model: GeneralizedRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[Tensor]]:
-    """What `model([photo])[0]` finds, with decided masks, of which one at a time is in memory.
+    """Run `model([photo])[0]` with decided masks, of which one at a time is in memory.
 
     Args:
         model: a torchvision Mask R-CNN in eval mode.

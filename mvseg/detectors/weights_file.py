@@ -24,7 +24,7 @@ MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # limit: pixels that photos are sca
 
 @dataclass(frozen=True)
 class Description:
-    """What a weights file says about its detector.
+    """Description of a detector in its weights file.
 
     Attributes:
         arch: architecture, see `list_architectures`.

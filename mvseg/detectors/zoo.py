@@ -36,7 +36,7 @@ HOMES = (Path(str(files("mvseg") / "zoo")), Path(str(files("mvseg"))).parent / "
 
 @dataclass(frozen=True)
 class ZooEntry:
-    """What ships under one name.
+    """Detector that ships under one name.
 
     Attributes:
         name: of the folder.

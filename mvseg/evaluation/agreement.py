@@ -25,7 +25,7 @@ class SharedLeaf:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Where two annotators of the same photos agree.
+    """Agreement of two annotators of the same photos.
 
     Attributes:
         kappa: Cohen's kappa of the ids of masks that both have (IoU above 0.5 in their view; one each). An id of the

@@ -121,7 +121,7 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
 
 
 def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> Judged:
-    """What each mask, and each instance, finds; see `leaf_metrics` for the arguments and what is raised."""
+    """Match each mask, and each instance, to the truth; see `leaf_metrics` for the arguments and what is raised."""
     if len(instance_ids) != len(regions) or len(truth) != regions.num_views:
         raise InputError(
             f"{len(instance_ids)} ids and {len(truth)} true label maps, "
@@ -148,7 +148,7 @@ def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]
 def find_segments(
     regions: Regions, segments: np.ndarray, truth: Sequence[np.ndarray], *, numbers: Sequence[Mapping[int, int]]
 ) -> SegmentMatches:
-    """Which true segment each estimated one finds; of several that could, the one with the largest IoU does.
+    """Match estimated segments to true ones; of several, the one with the largest IoU counts.
 
     Args:
         segments: (D,) int64 from 0 on without gaps, the segment that each mask is a part of.

@@ -46,7 +46,7 @@ class CocoAnnotation(BaseModel):
 
 
 class CocoFile(BaseModel):
-    """What every COCO file holds."""
+    """Fields of every COCO file."""
 
     images: Items[CocoImage]
     annotations: Items[CocoAnnotation]
@@ -58,7 +58,7 @@ class _Category(BaseModel):
 
 
 class CocoMasks(CocoFile):
-    """What is read of it; `categories` may be missing."""
+    """Fields that are read; `categories` may be missing."""
 
     categories: Items[_Category] = []
 

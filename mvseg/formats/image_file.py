@@ -290,12 +290,12 @@ def read_exposure(path: Path) -> float:
 
 
 def describe_turn(path: Path) -> str:
-    """That a tag turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
+    """Note on a tag that turns a photo, as the end of a sentence about sizes that do not fit; "" if none does."""
     return f"; EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 
 def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | None:
-    """What is wrong with an image's path relative to its folder, as the end of a sentence; None if it is valid."""
+    """Fault of an image's path relative to its folder, as the end of a sentence; None if it is valid."""
     path = os.path.normpath(file)
     starts_elsewhere = os.path.isabs(path) or path.startswith(os.sep) or os.path.splitdrive(path)[0]  # on Windows, too
     if starts_elsewhere or path.split(os.sep)[0] == "..":

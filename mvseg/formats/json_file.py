@@ -38,7 +38,7 @@ def read_json(path: Path, model: type[Model]) -> Model:
 
 
 def load_json(path: Path, *, most: int | None = None) -> Any:
-    """What a JSON file holds, unchecked.
+    """Content of a JSON file, unchecked.
 
     Raises:
         InputError: the file is missing, has more than `most` bytes, or is not JSON.
@@ -56,7 +56,7 @@ def load_json(path: Path, *, most: int | None = None) -> Any:
 
 
 def check_content(path: Path, content: Any, model: type[Model], *, expected: str = "") -> Model:
-    """What a file holds, as `model`.
+    """Content of a file, as `model`.
 
     Raises:
         InputError: it does not fit; names the file, the key, and what was expected.

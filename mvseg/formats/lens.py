@@ -56,13 +56,13 @@ def opencv_distortion(lens: pycolmap.Camera | None) -> list[float] | None:
 
 
 def photo_from_pinhole(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Where undistorted pixel positions lie in the photo: (P, 2) -> (P, 2) float64, pixel centres at half integers."""
+    """Distort pixel positions: (P, 2) -> (P, 2) float64, pixel centres at half integers."""
     rays = np.linalg.solve(K, np.concatenate([xy, np.ones((len(xy), 1))], 1).T).T
     return np.asarray(lens.img_from_cam(rays))
 
 
 def pinhole_from_photo(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> np.ndarray:
-    """Where photo positions lie in the undistorted image: (P, 2) -> (P, 2) float64; the inverse of the above."""
+    """Undistort positions in the photo: (P, 2) -> (P, 2) float64; the inverse of the above."""
     rays = np.asarray(lens.cam_from_img(np.ascontiguousarray(xy, dtype=np.float64)))
     return rays @ K[:2, :2].T + K[:2, 2]
 

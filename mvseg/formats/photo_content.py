@@ -30,7 +30,7 @@ class PhotoContent:
 
 
 def measure_content(photo: np.ndarray) -> PhotoContent:
-    """Of a photo (H, W, 3) uint8 as it is stored: without its lens distortion it would have black corners."""
+    """Measure a photo (H, W, 3) uint8 as it is stored: without its lens distortion it would have black corners."""
     pixels = photo[::STEP, ::STEP]
     levels = pixels.mean(2)
     return PhotoContent(

@@ -289,19 +289,19 @@ class Photos:
         return photo
 
     def content(self, view: int) -> PhotoContent:
-        """What the photo of a view shows; raises InputError as `read_photo` does."""
+        """Content of the photo of a view; raises InputError as `read_photo` does."""
         if view not in self._contents:
             self(view)
         return self._contents[view]
 
     def sha256(self, view: int) -> str:
-        """Of the file of a view, which must exist."""
+        """SHA-256 of the file of a view, which must exist."""
         if view not in self._hashes:
             self._hashes[view] = hash_files(self.scene.views[view].path)
         return self._hashes[view]
 
     def select(self, scene: Scene, views: Sequence[int]) -> Photos:
-        """Those of some views, which `scene` has in this order; what is known of them stays known."""
+        """Select photos of some views, which `scene` has in this order; what is known of them stays known."""
         chosen, places = Photos(scene), {view: place for place, view in enumerate(views)}
         chosen._cached = {places[view]: photo for view, photo in self._cached.items() if view in places}
         chosen._contents = {places[view]: each for view, each in self._contents.items() if view in places}

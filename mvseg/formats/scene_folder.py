@@ -42,7 +42,7 @@ READERS: dict[str, Callable[[Path], Scene]] = {
 def load_scene(folder: Path | str) -> Scene:
     """Load the cameras of a scene folder; photos are read later, when they are needed, and may be absent.
 
-    Cameras come from the first of these that is there: `cameras.json` (rig file), a COLMAP model in `sparse/` or
+    Cameras come from the first that exists: `cameras.json` (rig file), a COLMAP model in `sparse/` or
     `colmap/sparse/` (see `find_colmap_model`), `transforms.json` or `transforms_train.json` (nerfstudio, instant-ngp,
     Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP). Another program's `cameras.json`
     is left out where another of these is there, which an InputWarning says.
@@ -118,7 +118,7 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers of the masks in their files. Warns (InputWarning)
         of everything that is left out or matched by its base name only, of label images that hold 0 and 255 only, or a
-        number per class, and of what `mvseg check` calls an error (`mask_faults`).
+        number per class, and of errors of `mvseg check` (`mask_faults`).
 
     Raises:
         InputError: a file is missing, broken, or does not fit its view, a category is not there, none of the masks that

@@ -44,7 +44,7 @@ class Shape:
 
     @property
     def area(self) -> float:
-        """Of the polygon, mm^2: exact."""
+        """Area of the polygon, mm^2: exact."""
         x, y = self.outline.T
         return float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
 

@@ -113,7 +113,7 @@ def escape_text(text: str) -> str:
 
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
-    """What a YAML file holds; a line of OpenCV, "%YAML:1.0", is left out.
+    """Content of a YAML file; a line of OpenCV, "%YAML:1.0", is left out.
 
     Raises:
         InputError: as `read_text`, or it is not YAML, is nested more than 32 deep, uses aliases (nested ones expand 300
@@ -126,7 +126,7 @@ def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> An
         return yaml.load(text, loader)
     except InputError:
         raise
-    except Exception as error:  # yaml raises its own kinds, and those of what it builds
+    except Exception as error:  # yaml raises its own kinds, and those of its builders
         raise InputError(f"{path}: is not a YAML file ({' '.join(str(error).split())}), expected {expected}") from None
 
 

@@ -50,7 +50,7 @@ class _Intrinsics(BaseModel):
 
     @property
     def intrinsics(self) -> dict[str, Any]:
-        """Those that the file states."""
+        """Intrinsics that the file states."""
         return self.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
 
 

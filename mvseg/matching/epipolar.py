@@ -230,7 +230,7 @@ def dilate(counts: Tensor, radius: int) -> Tensor:
 
 
 def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
-    """Which pixels of a view lie in the epipolar band of which region (Eq. 2).
+    """Test which pixels of a view lie in the epipolar band of which region (Eq. 2).
 
     Args:
         regions: D regions; those of `view` itself, and of views that share its camera centre, have no band there.

@@ -1,4 +1,4 @@
-"""What a person knows of masks: that they show one leaf, or different ones. Not in the paper.
+"""What the user knows of masks: that they show one leaf, or different ones. Not in the paper.
 
 Masks that must be together are one node of the graph, and those that cannot never join one cluster: the search itself
 honours both (`ViewGraph`), so that a link pulls the rest of its leaf.

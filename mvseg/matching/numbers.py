@@ -51,7 +51,7 @@ class SymnmfNumbers:
 class SweepNumbers:
     """Hypotheses of the plane sweep. A third more or less changes at most one id on masks of 8 and 16 leaves."""
 
-    max_empty: float = 0.5  # insensitive: views of a hypothesis without a region, of those that see it: -0.005, 0
+    max_empty: float = 0.5  # insensitive: views that see a hypothesis but have no region there: -0.005, 0
     rays: int = 24  # limit: rays per region, at most: +0.001, +0.007
     plenty: int = 10  # limit: views up to which all these rays are cast; with more, each ray shows more
     depths: int = 96  # limit: depths along a ray: -0.034, -0.019
@@ -80,7 +80,7 @@ class EMNumbers:
 
 @dataclass(frozen=True)
 class HypothesisCostNumbers:
-    """What a view that does not show the cluster costs in a hypothesis, where one that shows it scores 1.
+    """Costs of a view that does not show the cluster in a hypothesis, where one that shows it scores 1.
 
     These and the gains were chosen on development plants (`benchmarks/matching.py --split dev`); a search for better
     ones only gained on the plants that it saw (docs/notes/matching.md). Where no change is given, it is 0.01 at most,
@@ -94,7 +94,7 @@ class HypothesisCostNumbers:
 
 @dataclass(frozen=True)
 class GainNumbers:
-    """What a region gains from a cluster in addition to its score there; one that stays alone gains nothing."""
+    """Gains of a region from a cluster in addition to its score there; one that stays alone gains nothing."""
 
     coverage: float = 0.5  # chosen: gain of a region that all best hypotheses of the cluster show: 0.02
     weight: float = 1 / 3  # insensitive: gain per unit of epipolar evidence for a pair of regions, over V - 1: 0.01
@@ -153,7 +153,7 @@ class DisagreementNumbers:
     """
 
     trusted: float = 0.75  # chosen: mean match score from which ids are taken for right
-    alike: float = 0.7  # chosen: what an odd view explains, as a share of what the median view explains, at most
+    alike: float = 0.7  # chosen: explained share of an odd view, relative to the median view, at most
     min_views: int = 4  # limit: views from which one of them can be told to be odd
 
 

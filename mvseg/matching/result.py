@@ -13,7 +13,7 @@ from mvseg.masks import Masks, MergedMask
 
 @dataclass(frozen=True, eq=False)
 class MatchReport:
-    """What matching says of a scene as a whole.
+    """Outcome of matching for the scene as a whole.
 
     Attributes:
         method: what produced the ids: "nview", "one-per-view" (also what nview falls back to when there are only two
@@ -33,7 +33,7 @@ class MatchReport:
 
     @staticmethod
     def join(reports: Sequence[MatchReport], weights: Sequence[int]) -> MatchReport:
-        """Of masks that were matched in parts, class by class; `weights`: the matched masks of each part.
+        """Join reports of masks that were matched class by class; `weights`: the matched masks of each part.
 
         The method is that of the first part, the residual the largest, the explained share the mean over the matched
         masks, or over the parts; None where a part has none.
@@ -52,7 +52,7 @@ class MatchReport:
 
 @dataclass(frozen=True, eq=False)
 class Matching:
-    """Which of D masks shows which of K instances: the table, and what is said of the scene.
+    """Assignment of D masks to K instances, and a report on the scene.
 
     Attributes:
         masks: the table.

@@ -44,7 +44,7 @@ class Samples:
         return float(self.weight.sum())
 
     def pixels(self, keep: Tensor | None = None) -> Samples:
-        """All pixels of the runs, or of those that are to be kept (P,) bool; samples of pixels as they are."""
+        """All pixels of the runs, or of some (P,) bool; samples of pixels as they are."""
         if self.last_xy is None or self.length is None:
             return self
         fields = (self.xy, self.last_xy, self.owner, self.weight, self.length)

@@ -20,8 +20,8 @@ def split_merged(masks: Masks) -> Masks:
 
     Returns:
         D' >= D masks on the same device and in the same order, the second part of a mask right after the first. Both
-        have its scores; none shows two instances any more. A mask stays whole if one part would be empty, or if a
-        person corrected it.
+        have its scores; none shows two instances any more. A mask stays whole if one part would be empty, or if
+        the user corrected it.
     """
     masks = masks.with_merged([each for each in masks.merged if not masks.is_corrected[each.region]])
     device, masks = masks.regions.device, masks.to("cpu")

@@ -1,4 +1,4 @@
-"""The graph that all methods cluster: epipolar weights, the views of the regions, and what a person knows of them."""
+"""The graph that all methods cluster: epipolar weights, the views of the regions, and what the user knows of them."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class ViewGraph:
 
     @property
     def is_linked(self) -> Bools:
-        """(D,) whether a person says anything of a region."""
+        """(D,) whether the user says anything of a region."""
         return self.is_joined | self.apart.any(1)
 
     def contract(self) -> Floats:
@@ -164,7 +164,7 @@ class Movers:
 
 
 def first_without_links(graph: ViewGraph, cluster: Callable[[ViewGraph, Clusters | None], Clusters]) -> Clusters:
-    """What a method finds without links where it agrees with all of them: it is the best partition under them, too.
+    """Partition of a method without links where it agrees with all of them: it is the best partition under them, too.
     Otherwise what it finds with them; then it is told what it found without."""
     found = cluster(graph.without_links, None)
     return found if graph.links.agree(found) else cluster(graph, found)

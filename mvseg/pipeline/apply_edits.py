@@ -76,7 +76,7 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
 def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant, Tensor]:
     """Match the edited masks anew, but for those of leaves that stay: these keep their ids.
 
-    Where the views choose, and a person speaks of such leaves only, nothing is matched, and what matching said stays.
+    Where the views choose, and the user speaks of such leaves only, nothing is matched, and what matching said stays.
 
     Args:
         corrected: D masks and their links.
@@ -107,6 +107,6 @@ def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:
-    """The detected masks of a table that are not in it any more, after a person's edits."""
+    """The detected masks of a table that are not in it any more, after the user's edits."""
     is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
     return before.select(~torch.isin(before.regions.labels, after.regions.labels.cpu()[is_left]))

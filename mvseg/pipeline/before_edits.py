@@ -1,4 +1,4 @@
-"""What was known before a person's edits, kept in a result: `mvseg correct` opens with it, and finds nothing anew.
+"""What was known before the user's edits, kept in a result: `mvseg correct` opens with it, and finds nothing anew.
 
 It holds only where all that it follows from is the same: the version of mvseg and of torch, options, photos and cameras
 (see `RecordedRun.changes`). Elsewhere, and where the file is gone, all is computed as before.
@@ -43,7 +43,7 @@ CLASSES: list[Any] = [
 
 
 def pack_plant(plant: Plant, said: Sequence[Finding]) -> bytes | None:
-    """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`). None where it is
+    """Pack a plant before edits, its surfaces, and the warnings on the way (`said`). None where it is
     too much to be read again."""
     packed = io.BytesIO()
     opened = plant.opened
@@ -62,7 +62,8 @@ def pack_plant(plant: Plant, said: Sequence[Finding]) -> bytes | None:
 
 
 def unpack_plant(content: bytes, opened: Opened) -> tuple[Plant, list[Finding]] | None:
-    """What `pack_plant` packed, on the CPU, for the scene as it was opened, with its caches, and the warnings.
+    """Unpack the content of `pack_plant`, on the CPU, for the scene as it was opened, with its caches, and the
+    warnings.
 
     None: it is of other views, or something else.
     """

@@ -47,7 +47,7 @@ def check_result(result: Result, plant: Plant) -> Result:
 
 
 def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
-    """The final masks and ids, and their surfaces: what the page shows that a person corrects.
+    """The final masks and ids, and their surfaces: what the page shows that the user corrects.
 
     Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted by a later one.
 

@@ -47,7 +47,7 @@ def learn(
 ) -> Plant:
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
-    A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
+    A round: labels from what the views chose, and from what the user corrected; the weights that the run began with
     learn these (`fine_tune`); the detector looks again, at the same size and at those next to it (`run_near`); the
     views choose. The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end
     when it grows by less than `GROWTH`. Ctrl-C ends them, too, and what was there stays.
@@ -56,7 +56,7 @@ def learn(
         plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of the user, whose masks are certain.
-        rounds: that a person asks for, who judges himself: so many are learned, and the last weights stay. None: as
+        rounds: that the user asks for, who judges himself: so many are learned, and the last weights stay. None: as
             many as `RunConfig.learn` says, and the agreed area judges.
 
     Returns:

@@ -46,7 +46,7 @@ class Opened:
         views_left_out: names of the other views.
         config: the options of all stages.
         inputs: {file or folder: SHA-256 as it was read} of cameras and masks, or of the detector's weights.
-        surfaces: cache of what was fitted to masks of the scene.
+        surfaces: cache of surfaces that were fitted to masks of the scene.
         snapped: {digest of a mask and the photo around it: the mask with edges of colour}, see `snap_masks`.
     """
 
@@ -62,11 +62,11 @@ class Opened:
 
     @property
     def names(self) -> list[str]:
-        """Of the views."""
+        """Names of the views."""
         return [view.name for view in self.scene.views]
 
     def find_disagreement(self, matching: Matching) -> Finding | None:
-        """Where the views disagree about the masks, see `mvseg.matching.match.find_disagreement`."""
+        """Find out whether the views disagree about the masks, see `mvseg.matching.match.find_disagreement`."""
         return find_disagreement(matching, self.names, is_detected=self.given is None)
 
     @property

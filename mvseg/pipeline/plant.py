@@ -89,7 +89,7 @@ class Plant:
 
     @cached_property
     def shown(self) -> Masks:
-        """The masks that a person sees, and edits: those that were given, or those that the views chose, and what else
+        """The masks that the user sees, and edits: those that were given, or those that the views chose, and what else
         was surely detected beside these."""
         if self.opened.is_chosen:
             return add_beside(self.masks, self.matched[0], self.scene.cameras)

@@ -1,6 +1,6 @@
 """The whole method on a page: from a scene's folder to the same id for a leaf in every view, and its shape.
 
-Everybody calls these lines: `mvseg infer` and `mvseg batch` call `run_scene`, and the page that a person corrects keeps
+Everybody calls these lines: `mvseg infer` and `mvseg batch` call `run_scene`, and the page that the user corrects keeps
 one `Plant`, and calls those that follow it.
 """
 
@@ -40,7 +40,7 @@ def run_scene(
 
     Args:
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
-        corrections: of a person, or the file of them, see `load_corrections`; without any edits they change nothing.
+        corrections: of the user, or the file of them, see `load_corrections`; without any edits they change nothing.
         force_corrections: apply them even if they were made for other photos.
         cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or

@@ -56,7 +56,7 @@ class PoseConfig:
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the world; at most one of the first four.
+    """Facts that are known of the world; at most one of the first four.
 
     Attributes:
         board: a printed ChArUco board, which then defines the axes of the world.
@@ -75,7 +75,7 @@ class Known:
 
     @property
     def scales(self) -> list[str]:
-        """Names of what gives a scale."""
+        """Names of options that give a scale."""
         return [name for name in ("board", "marker", "distance", "positions") if getattr(self, name) is not None]
 
     def __post_init__(self) -> None:

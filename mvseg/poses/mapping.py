@@ -31,7 +31,7 @@ NEXT_STEPS = (
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What structure from motion found, up to a similarity.
+    """Result of structure from motion, up to a similarity.
 
     Attributes:
         model: COLMAP's reconstruction of the registered photos; images have the names of the photos.

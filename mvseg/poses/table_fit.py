@@ -28,7 +28,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 # How far lenses of phones, cameras and webcams are from a pinhole with its axis in the middle: standard deviations of
-# the numbers of a lens but f. Most of what a flat board leaves open is the principal point's: at twice that, f is half
+# the numbers of a lens but f. A flat board leaves mostly the principal point open: at twice that, f is half
 # as sure; a third of the others changes its deviation by less than a twentieth.
 USUAL = np.array([TABLE.off_middle, TABLE.off_middle, 0.3, 0.3, 0.001, 0.001])
 NUM_LENS = 1 + len(USUAL)  # f in widths of the photo; cx and cy from its middle, in widths; k1, k2, p1, p2
@@ -74,7 +74,7 @@ class Sightings:
 
 @dataclass(frozen=True, eq=False)
 class TableFit:
-    """What explains the sightings best.
+    """Parameters that explain the sightings best.
 
     Attributes:
         cameras: C, with the deviations of their focal lengths.

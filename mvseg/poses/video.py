@@ -29,7 +29,7 @@ SILENT = "-8"  # of FFmpeg's log, which is for its developers
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """What a look at every frame, or at every second or third one, found.
+    """Motion in every frame, or in every second or third one.
 
     Attributes:
         frames: (F,) int64, numbers of the frames in the video, from 0.

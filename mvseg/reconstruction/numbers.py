@@ -1,7 +1,7 @@
 """The numbers of reconstruction: definitions, technical limits, and what was fitted to development plants.
 
 `python benchmarks/thirds.py --cache DIR --room reconstruction` prints what a third less or more of each changes; the
-table is in docs/notes/surfaces.md. Shares are of what the sentence names; "masks" are those of one leaf.
+table is in docs/notes/surfaces.md. A share is relative to the noun in its sentence; "masks" are those of one leaf.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class StartNumbers:
 
 @dataclass(frozen=True)
 class PriorNumbers:
-    """Standard deviations of what should be none: bend, sway and speed in leaf lengths, the rest in half-widths."""
+    """Standard deviations of the prior: bend, sway and speed in leaf lengths, the rest in half-widths."""
 
     bend_sd: float = 0.06  # chosen: third differences of m
     sway_sd: float = 0.1  # chosen: times length / width: turns of the midrib within the blade, piece to piece
@@ -104,7 +104,7 @@ class FitNumbers:
     least_scale_px: float = 0.7  # chosen: the same in the end, at least
     scale_factor: float = 4.0  # chosen: the same in median distances, at least: masks may contradict each other
     offset_from: int = 6  # chosen: step from which masks may be too large or small
-    offset_share: float = 0.8  # chosen: share of what is measured of that which is believed
+    offset_share: float = 0.8  # chosen: share of a measured offset that is believed
     clean_px: float = 1.0  # chosen: deviation of distances of clean masks; above, fold and curl stay near none
     narrow: float = 0.15  # chosen: width of half a leaf that limits steps, as a share of its length, at least
     noisy_view: float = 1.5  # chosen: deviation of a view's distances from which it counts less, in the usual one
@@ -112,7 +112,7 @@ class FitNumbers:
     difference: float = 1e-4  # limit: move of a coefficient for a derivative, as a share of the spread of all
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     # Where masks are clean, little is measured.
-    centre_factor: float = 1.5  # chosen: deviation of what all masks may be too large by, in the measured one
+    centre_factor: float = 1.5  # chosen: sd of the common offset of all masks, in the measured one
     least_centre_sd: float = 0.1  # chosen: the same in pixels, at least
     # Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15.
     least_eigenvalue: float = 1e-10  # limit: least eigenvalue of a scaled normal matrix that is not singular
@@ -199,7 +199,7 @@ class ErrorNumbers:
 
 @dataclass(frozen=True)
 class StemNumbers:
-    """Which end of a leaf is its base."""
+    """Numbers that tell the base of a leaf from its tip."""
 
     least_leaves: int = 4  # limit: leaves from which the stem is looked for
     clear: float = 0.25  # chosen: share of the length by which the base is nearer to the stem than the tip, to be sure

@@ -244,7 +244,7 @@ def _is_in(mask: Tensor, px_from_world: Tensor, axes: list[Tensor]) -> Tensor:
 def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    Cells are halved until the box of those that are left is `VOXELS.search_cells` cells long and hardly shrinks any
+    Cells are halved until the box of the remaining ones is `VOXELS.search_cells` cells long and hardly shrinks any
     more. None when no cell is left.
     """
     before = torch.inf

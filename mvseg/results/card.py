@@ -27,7 +27,7 @@ class Card:
 
     Attributes:
         found: how many leaves, in how many photos.
-        doubt: the finding that explains most of what is missing or wrong; None where there is none.
+        doubt: the finding that explains most faults; None where there is none.
         next_step: what helps most, and the command that does it.
     """
 

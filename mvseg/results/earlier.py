@@ -36,7 +36,7 @@ KINDS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Output:
-    """What a command is about to write into a folder.
+    """Output of a command that is about to write into a folder.
 
     Attributes:
         kind: of the folder.
@@ -57,7 +57,7 @@ class Output:
         return POSE_FILE if self.kind == "scene" else RUN_FILE
 
     def describe(self, out: Path) -> dict[str, Any]:
-        """What run.json in `out` says of it: under "of" absolute paths, and the same as seen from there."""
+        """Entry of run.json in `out` about it: under "of" absolute paths, and the same as seen from there."""
         places = [os.path.realpath(path) for path in self.of]
         return {"kind": self.kind, "of": {path: path_from(out, path) for path in places}}
 

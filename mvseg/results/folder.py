@@ -81,7 +81,7 @@ def save_result(
 
 
 def describe_result(result: Result) -> dict[str, Any]:
-    """What run.json says of the outcome of a run: of the scene, matching, traits and corrections; counts and
+    """Entries of run.json about the outcome of a run: of the scene, matching, traits and corrections; counts and
     timings."""
     report, scene = result.matching.report, result.scene
     shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]

@@ -102,7 +102,7 @@ class _Instances(BaseModel):
 
 
 def load_learned(folder: Path, run: RunRecord) -> Learned:
-    """What the detector has learned from the scene of a result."""
+    """Load the weights that the detector has learned from the scene of a result."""
     path = folder / DETECTOR_FILE
     weights = path.read_bytes() if path.is_file() else None
     return Learned(weights=weights, rounds=run.learned.rounds, agreed_area=run.learned.agreed_area)

@@ -31,7 +31,7 @@ class Instances:
     `Matching.support`.)
 
     Attributes:
-        probabilities: {instance id: P}, how likely it is a leaf; of those that the views chose.
+        probabilities: {instance id: P} of leaves that the views chose.
         starts: {instance id: surface} that they were chosen by, and the final ones are fitted from.
         surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
             requested.
@@ -73,7 +73,7 @@ class Instances:
 
 @dataclass(frozen=True)
 class Learned:
-    """What came of it that the views taught the detector, see `mvseg.pipeline.learn`.
+    """Outcome of teaching the detector by the views, see `mvseg.pipeline.learn`.
 
     Attributes:
         weights: content of the file of the weights that found the leaves, if they were learned here; None: they were
@@ -107,7 +107,7 @@ class Result:
         num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
             check.
         views_left_out: names of the scene's other views, see `RunConfig.views`.
-        corrections: of a person; None where there were none.
+        corrections: of the user; None where there were none.
         fates: the outcome of each of them.
         learned: by the detector from this scene.
         before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_plant`); None: nothing is kept.

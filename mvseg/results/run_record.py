@@ -23,7 +23,7 @@ class _Part(BaseModel):
 
 
 class MatchingRecord(_Part):
-    """What else `MatchReport` holds."""
+    """Other fields of `MatchReport`."""
 
     has_probabilities: bool = False
     explained: float | None = None
@@ -51,7 +51,7 @@ class LearnedRecord(_Part):
 
 
 class RunRecord(_Part):
-    """What the run knew that made a result. Attributes are the fields of run.json, see docs/results.md; further fields
+    """Record of the run that made a result. Attributes are the fields of run.json, see docs/results.md; further fields
     of the file are kept, too."""
 
     format: int = Field(1, ge=1)
@@ -87,7 +87,7 @@ class RunRecord(_Part):
             return ()
 
     def as_json(self) -> dict[str, Any]:
-        """What the file holds."""
+        """Content of the file."""
         return self.model_dump(mode="json", exclude_unset=True)
 
 
@@ -110,7 +110,7 @@ def load_run(folder: Path) -> RunRecord:
 
 
 def find_place(folder: Path, run: RunRecord, stated: Path) -> Path:
-    """Where a file or folder is now that the run of a result names: where it was, or at the same place as seen from the
+    """Find a file or folder that the run of a result names: where it was, or at the same place as seen from the
     result, since they may have moved together; where it was, if it is nowhere."""
     from_here = run.config.get("from_here")
     if stated.exists() or not isinstance(from_here, dict):

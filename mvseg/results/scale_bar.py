@@ -21,7 +21,7 @@ MOST = 0.2  # definition: length of a bar, as a share of the photo's width, at m
 
 @dataclass(frozen=True)
 class ScaleBar:
-    """What is drawn.
+    """A bar with its length.
 
     Attributes:
         share: its length, as a share of the photo's width, in (0, 0.2].

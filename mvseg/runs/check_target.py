@@ -75,7 +75,7 @@ class MeasuredShape:
 
 @dataclass(frozen=True)
 class TargetCheck:
-    """What the photographed page says of a chain.
+    """Verdict of the photographed page on a chain.
 
     Attributes:
         shapes: all that are on the page.
@@ -116,7 +116,7 @@ class TargetCheck:
         return said if self.is_right else f"{said}: they are less certain than their standard deviations say"
 
     def describe(self) -> dict[str, Any]:
-        """What target.json says: areas in mm^2, errors as shares; null where there is none."""
+        """Content of target.json: areas in mm^2, errors as shares; null where there is none."""
         shapes = [asdict(shape) | {"error": shape.error, "holds": shape.holds} for shape in self.shapes]
         known = [{key: None if value != value else value for key, value in shape.items()} for shape in shapes]
         return asdict(self) | {"shapes": known, "is_right": self.is_right, "verdict": self.verdict}

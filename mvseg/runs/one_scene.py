@@ -132,7 +132,7 @@ def save_scene(solved: Solved, request: RunRequest, output: Output) -> None:
 
 
 def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[str, Any]:
-    """Where a result comes from, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
+    """Origin of a result, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
     detector's weights, too), and the options of the stages that ran; and the findings."""
     options = asdict(config)
     if masks is not None:

@@ -130,7 +130,7 @@ def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig) -> list[PhotoF
 def describe_poses(
     structure: Structure, placement: Placement, *, files: Sequence[PhotoFile], lengths: Sequence[FocalLength]
 ) -> dict[str, Any]:
-    """What pose.json says besides options and files."""
+    """Entries of pose.json besides options and files."""
     cameras = [camera for _, camera in sorted(structure.model.cameras.items())]
     turned = [photo.name for photo in files if photo.is_turned]
     return {

@@ -38,7 +38,7 @@ class RecordedRun:
         config: the options of its stages.
         scene: folder of the scene.
         masks: that were given; None: a detector found them.
-        corrections: file of a person's edits; None without any.
+        corrections: file of the user's edits; None without any.
         changes: inputs that are other ones now, another version of mvseg, and options that this version no longer has.
     """
 
@@ -82,7 +82,7 @@ def read_recorded(folder: Path) -> RecordedRun:
 
 
 def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path | None) -> dict[str, Any]:
-    """What run.json says of the places of a run: absolute paths, and under "from_here" those from the result."""
+    """Entries of run.json about the places of a run: absolute paths, and under "from_here" those from the result."""
     places = {"scene": scene, "out": out, "masks": masks, "corrections": corrections}
     absolute = {name: None if path is None else str(path.resolve()) for name, path in places.items()}
     return absolute | {"from_here": {name: path_from(out, path) for name, path in absolute.items() if path is not None}}

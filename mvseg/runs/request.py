@@ -24,7 +24,7 @@ class RunRequest:
         masks: file or folder; None: a detector finds them.
         out: folder of the result.
         config: the options of all stages.
-        corrections: file of a person's edits; None without any.
+        corrections: file of the user's edits; None without any.
         force_corrections: apply them even if they were made for other photos.
         overwrite: `out` may hold another scene's result, what another command wrote, or what a run found in its photos.
         learned: weights that have learned this scene before are used, and not learned again.
@@ -66,7 +66,7 @@ def repeat_run(
         learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: what the run has learned
             before is used.
         detector: file of weights that have learned this scene; None: that of the result, if it has one.
-        corrections: file of a person's edits; None: that of the run, if it had one.
+        corrections: file of the user's edits; None: that of the run, if it had one.
 
     Raises:
         InputError: see `read_recorded`.
@@ -89,7 +89,7 @@ def repeat_run(
 
 
 def find_given(scene: Path, given: Path, beside: Path = Path(), *, what: str = "masks") -> Path:
-    """Where masks, or `what` else is given with a scene, lie.
+    """Find masks, or `what` else is given with a scene.
 
     A relative path may start at the scene folder or at `beside`, as long as only one of the two exists.
 

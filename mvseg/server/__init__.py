@@ -1,1 +1,1 @@
-"""Serves pages on which a person corrects: saves each edit at once, and computes again what follows from it."""
+"""Serves pages on which the user corrects: saves each edit at once, and computes again what follows from it."""

@@ -1,4 +1,4 @@
-"""What a person corrects in a page: each edit is saved at once, and its consequences are computed and shown."""
+"""What the user corrects in a page: each edit is saved at once, and its consequences are computed and shown."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mvseg.system.running import Cancelled, running
 
 WAIT_SECONDS = 20.0  # limit: that a page's question for news stays open
 LOOK_SECONDS = 1.0  # limit: until it looks again whether another program has changed the edits
-STEP_SECONDS = 1.0  # limit: between two words of what is computed
+STEP_SECONDS = 1.0  # limit: between two words about a computation
 LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # chosen: that learning takes on two cores, which the page says before
 
 
@@ -63,7 +63,8 @@ class OpenFolder(Protocol):
         """The page with the newest result, and with all edits."""
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
-        """What follows from the edits, perhaps in several steps. Raises Cancelled: `is_old` said so; InputError."""
+        """Compute the consequences of edits, perhaps in several steps. Raises Cancelled: `is_old` said so;
+        InputError."""
 
     def again(self, place: Path) -> list[str]:
         """The words after `mvseg` that make all in the folder anew; they may name files written into `place`."""
@@ -88,7 +89,7 @@ class Learner(Protocol):
 
 @dataclass(frozen=True)
 class Update:
-    """What follows from edits: the news for the page, what hinders each edit ("" for nothing), and warnings."""
+    """Consequences of edits: the news for the page, what hinders each edit ("" for nothing), and warnings."""
 
     news: dict[str, Any] | None
     outcomes: list[str]
@@ -281,7 +282,7 @@ class Corrector(Generic[Kind]):
         self.news.notify_all()
 
     def state(self, after: int) -> dict[str, Any]:
-        """What the page shows, and the name of the edits that are saved (`revision`): at once for an `after` below 0,
+        """State of the page, and the name of the edits that are saved (`revision`): at once for an `after` below 0,
         otherwise as soon as there is something newer."""
         with self.news:
             end = time.monotonic() + WAIT_SECONDS

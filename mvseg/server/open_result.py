@@ -67,7 +67,7 @@ class OpenResult:
     Attributes:
         folder: of the result.
         run: that made it.
-        notice: what a person should know of it; "" for nothing.
+        notice: what the user should know of it; "" for nothing.
         opened: its scene, and its masks if they were given.
     """
 
@@ -118,7 +118,7 @@ class OpenResult:
         return len(self.scene.views)
 
     def read_edits(self) -> tuple[Corrections, str]:
-        """The edits in the folder, and what a person should know of them."""
+        """The edits in the folder, and what the user should know of them."""
         found = self.saved_corrections()
         with collect_warnings() as noticed:
             check_made_for(found, self.photos)
@@ -135,7 +135,7 @@ class OpenResult:
         return build_page(shown, pictures, run=self.run.said.as_json(), is_served=True)
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
-        """What follows from the edits, see `recompute`."""
+        """Compute the consequences of edits, see `recompute`."""
         shown, outcomes, messages = self.recompute(corrections, is_old)
         made_with = () if self._saved.corrections is None else self._saved.corrections.edits
         if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
@@ -167,7 +167,7 @@ class OpenResult:
         return self.saved_result()
 
     def saved_corrections(self) -> Corrections:
-        """What was saved into the result folder before; none without the file."""
+        """Corrections in the result folder; none without the file."""
         path = self.folder / CORRECTIONS_FILE
         return load_corrections(path) if path.is_file() else Corrections()
 
@@ -206,7 +206,7 @@ class OpenResult:
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]
 
     def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:
-        """Let the detector learn the leaves that the views agree about, and those that a person outlined, in one round;
+        """Let the detector learn the leaves that the views agree about, and those that the user outlined, in one round;
         `learned` is what is known then, and None undoes it. Each time begins with the weights of the run.
 
         Args:
@@ -229,7 +229,7 @@ class OpenResult:
         self.learned = None
 
     def again(self, place: Path) -> list[str]:
-        """`mvseg infer --again`, with options by which the whole result is found by the detector of what is shown,
+        """`mvseg infer --again`, with options by which the whole result is found by the detector of the page,
         whichever lies in the folder by now; its weights are written into the folder `place`."""
         return ["infer", "--again", str(self.folder.resolve()), *self._again_with(place)]
 
@@ -247,7 +247,7 @@ class OpenResult:
         return ["--detector", str(place / DETECTOR_FILE)]
 
     def outline(self, text: bytes) -> dict[str, Any]:
-        """An outline of what lies in a rough one, both in pixels of the user's photo.
+        """Refine a rough outline, both in pixels of the user's photo.
 
         Raises:
             InputError: a request of another form, no such view, or nothing to outline.

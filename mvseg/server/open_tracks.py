@@ -1,4 +1,4 @@
-"""Tracks that a person corrects: links between dates; each edit tracks the plant anew."""
+"""Tracks that the user corrects: links between dates; each edit tracks the plant anew."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class OpenTracks:
         return OpenTracks(self.folder, self.plant.plant)
 
     def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
-        """What a person says, and what hinders each edit; "" for nothing."""
+        """What the user says, and what hinders each edit; "" for nothing."""
         links, problems = find_plant_links(corrections.edits, self.dates)
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
@@ -140,6 +140,6 @@ def _describe_question(question: Question) -> dict[str, Any]:
 
 
 def _without_pictures(data: Mapping[str, Any]) -> dict[str, Any]:
-    """What may have changed of what the page shows: pictures of leaves stay."""
+    """Data of the page that may have changed: pictures of leaves stay."""
     leaves = [{k: v for k, v in leaf.items() if k not in ("crop", "place")} for leaf in data["leaves"]]
     return {**data, "leaves": leaves}

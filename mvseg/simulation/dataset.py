@@ -32,7 +32,7 @@ EVALUATED_FAMILIES = ("ovate", "lanceolate", "rosette", "strap", "lobed", "compo
 
 @dataclass(frozen=True)
 class Preset:
-    """What a data set consists of: for every split, number of leaves and number of views, that many plants.
+    """Plan of a data set: for every split, number of leaves and number of views, that many plants.
 
     A plant is the same for every number of views, and different from every plant of another split.
 
@@ -110,7 +110,7 @@ def list_specs(preset: Preset, seed: int) -> list[SceneSpec]:
 
 
 def plant_index(scene: SceneSpec) -> int:
-    """Which plant of its split and number of leaves a scene shows, from 0."""
+    """Index of the plant of a scene among those of its split and number of leaves."""
     return int(scene.folder.split("-")[1].split("_")[0])
 
 

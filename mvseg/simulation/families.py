@@ -14,7 +14,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Family:
-    """What the plants of one family have in common."""
+    """Traits that plants of one family have in common."""
 
     outline: tuple[float, float]  # (a, b): half-width ~ u^a (1-u)^b
     length: Range  # of a full-grown blade

@@ -50,7 +50,7 @@ class SimulatedPlant:
 
 @dataclass(frozen=True, eq=False)
 class StemNode:
-    """Where a frond sits on a stem: point (3,), azimuth, age from 0 (youngest) to 1, size factor."""
+    """Place of a frond on a stem: point (3,), azimuth, age from 0 (youngest) to 1, size factor."""
 
     point: Floats
     azimuth: float
@@ -196,7 +196,7 @@ def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tu
 
 
 def place_foot(family: Family, rng: np.random.Generator, *, azimuth: float, is_first: bool) -> tuple[StemNode, float]:
-    """Where a shoot comes out of the soil, the first one in the middle, and its tilt."""
+    """Place and tilt of a shoot, the first one in the middle."""
     out = rng.uniform(0.2, 0.45) * family.pot_radius * (not is_first)
     point = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
     tilt = math.radians(rng.uniform(*family.lean) + 6 * (not is_first))

@@ -110,7 +110,7 @@ def draw_look(rng: np.random.Generator) -> Look:
 
 
 def draw_wild_look(look: Look, rng: np.random.Generator) -> Look:
-    """The look with some of what photos from homes and gardens have: stems as green as leaves, green pots and mats,
+    """The look with some features of photos from homes and gardens: stems as green as leaves, green pots and mats,
     waxy or wet leaves, overexposure, and black studios, windows or other plants behind."""
     plain, backdrop = look.plain.copy(), look.backdrop
     stem, pot, ground = 0, 1, 3

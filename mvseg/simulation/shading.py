@@ -21,7 +21,7 @@ BROWN = np.array([0.17, 0.09, 0.035], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where n rays from the camera meet a surface; world frame, mm.
+    """Points where n rays from the camera meet a surface; world frame, mm.
 
     Attributes:
         points: (n, 3).
@@ -89,7 +89,7 @@ def highlight(look: Look, uv: Floats, *, normal: Floats, view: Floats, direct: F
 def leaf_color(
     look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, dryness: Floats, has_parallel_veins: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """What leaves of some dryness (n,) look like at (n, 2) positions `uv` on them.
+    """Colour of leaves of some dryness (n,) at (n, 2) positions `uv` on them.
 
     Returns:
         Albedo (n, 3); colour (n, 3) of the light that passes through; slope (n,) of the surface towards the tip.
@@ -154,7 +154,7 @@ def sample_texture(texture: Floats, x: Floats, y: Floats) -> Floats:
 
 
 def backdrop_color(look: Look, view: Floats) -> Floats:
-    """(n, 3) radiance of what is seen beyond the ground, along unit directions (n, 3)."""
+    """(n, 3) radiance beyond the ground, along unit directions (n, 3)."""
     rows, columns = look.backdrop.shape[:2]
     x = (np.arctan2(view[:, 1], view[:, 0]) / (2 * np.pi) % 1) * columns
     y = (0.5 - np.arcsin(np.clip(view[:, 2], -1, 1)) / np.pi) * rows

@@ -13,7 +13,7 @@ EXPECTED = {"load": 1.0, "detect": 9.0, "match": 2.0, "choose": 5.0, "learn": 30
             "check": 1.0, "voxels": 0.3, "measure": 1.5, "write": 3.0}  # fmt: skip
 FOLLOWED = {"learn": ("detect", "match", "choose"), "detect": ("match",)}  # definition: what comes after a stage
 COVERED = {"detect": 1.0, "learn": 1.0}  # definition: the only bar of these stages is all of it
-COVERS = 0.5  # chosen: part of what is left of another stage that one of its bars covers: nobody knows how many come
+COVERS = 0.5  # chosen: share of the rest of another stage that one of its bars covers: nobody knows how many come
 REFRESH_SECONDS = 0.1  # limit: between two changes of the line
 KNOWN = 0.03  # chosen: part of a command after which its speed is known
 

@@ -106,7 +106,7 @@ class Poses:
 
 
 def list_poses(pair: Pair) -> Poses:
-    """The poses of two dates, each in its own frame, that look best, and those that leaves suggest which a person says
+    """The poses of two dates, each in its own frame, that look best, and those that leaves suggest which the user says
     are one, each refined; where up is not known, of any rotation. Without leaves on one of them, only that it stood as
     it stood."""
     if not pair.fewer:
@@ -160,7 +160,7 @@ def _as_it_stood(pair: Pair) -> Alignment:
 
 
 def large_new(pair: Pair, pairs: np.ndarray) -> float:
-    """What leaves of the larger half that are in no pair cost; 0 where all leaves of the date with fewer are in one:
+    """Cost of leaves of the larger half that are in no pair; 0 where all leaves of the date with fewer are in one:
     then large ones were missed there. A plant that is turned onto its own older leaves has many."""
     if len(pairs) == pair.fewer:
         return 0.0

@@ -26,7 +26,7 @@ CALIBRATION = (0.33, 4.08)
 
 @dataclass(frozen=True)
 class Association:
-    """Two sights of one leaf that follow each other, and the probability that they are of one: 1 if a person says so.
+    """Two sights of one leaf that follow each other, and the probability that they are of one: 1 if the user says so.
 
     `link_leaves` gives it for dates that are surely aligned, `sum_over_poses` for any.
     """
@@ -48,7 +48,7 @@ def link_leaves(
 
     Args:
         counts: number of leaves with a shape on each date.
-        same, different: pairs of sights that a person says are one leaf, or are not.
+        same, different: pairs of sights that the user says are one leaf, or are not.
 
     Raises:
         InputError: the pairs contradict each other.
@@ -64,7 +64,7 @@ def link_leaves(
     gains += gains.T
     tracks = join_sights(gains, date_of)
     if any((tracks[one] == tracks[other]) != (gain > 0) for (one, other), gain in asked.items()):
-        raise InputError("what a person says of leaves over days contradicts itself")
+        raise InputError("what the user says of leaves over days contradicts itself")
     links = []
     for later in range(1, len(counts)):
         chances = _probabilities(tracks, gains, later=date_of >= later)
@@ -80,7 +80,7 @@ def link_leaves(
 
 def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[Association]:
     """The links with probabilities summed over poses: that each is right under the one that was taken, and under the
-    others. What a person says is so under all of them."""
+    others. What the user says is so under all of them."""
     found = []
     for link in links:
         (earlier, row), (later, column) = link.before, link.after
@@ -92,7 +92,7 @@ def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[A
 
 def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     """{(earlier, later): (N, M) probability that leaves of these two dates are the same, summed over poses}, whatever
-    other dates and what a person say; for asking about those that are not linked."""
+    other dates and what the user say; for asking about those that are not linked."""
     found = {}
     for pair, costs in compared.costs.items():
         odds = np.exp(np.clip(LINKING.unlinked - costs, -LINKING.most_odds, LINKING.most_odds))

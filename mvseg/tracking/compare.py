@@ -65,7 +65,7 @@ def compare_dates(
     """Dates at most `LINKING.most_gap` apart are compared.
 
     `place_dates` says how they stand to each other, before anything is linked. Of `same` and `different`, pairs of
-    sights that a person says are one leaf, or are not, the earlier one first, the poses take note.
+    sights that the user says are one leaf, or are not, the earlier one first, the poses take note.
     """
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)

@@ -53,7 +53,7 @@ class SeenLeaf:
         points: (cloud, 3) points of the leaf: of a surface, rows from base to tip of edge, midrib, edge; None with the
             midrib.
         is_oriented: the first point of the midrib is known to be the base.
-        numbers: {trait: number} of what was measured.
+        numbers: {trait: number} of measured traits.
         is_doubted: it looks like a stem, as rolled leaves of seedlings do: it counts if another date shows the leaf.
         node: numbers of its stem and of its node there; None: it is not known to sit on one.
     """

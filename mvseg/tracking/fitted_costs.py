@@ -21,8 +21,8 @@ from mvseg.tracking.numbers import COSTS, SIGHTS
 
 @dataclass(frozen=True)
 class Scales:
-    """Of the differences between two sights of one leaf: of places in `Pair.scale`, of angles in radians, of lengths as
-    natural logarithms.
+    """Scales of differences between two observations of one leaf: of places in `Pair.scale`, of angles in radians, of
+    lengths as natural logarithms.
 
     Attributes:
         across: of the base, away from the stem.
@@ -125,7 +125,7 @@ class Differences:
 
 def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = None) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
-    likelier than not. What a person says of them counts, too. `widths`: see `Differences`."""
+    likelier than not. What the user says of them counts, too. `widths`: see `Differences`."""
     return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.said
 
 

@@ -50,7 +50,7 @@ class GrowthCurve:
             (c / r) ln(1 + exp(r (t - t0))).
         parameters: K, or the rate c of the linear growth; r, per day; and t0, days. The latter are NaN of a constant.
         sds: standard deviations of these three; NaN where the dates do not tell them.
-        residual: root mean square of what is left, in standard deviations of the sizes.
+        residual: root mean square of residuals, in standard deviations of the sizes.
         criterion: Akaike's.
     """
 
@@ -73,7 +73,7 @@ class PlantRow:
 
     Attributes:
         date: index into `Tracks.dates`.
-        leaves, born, gone: numbers of leaves, and of those that appeared or went since the date before.
+        leaves, born, gone: numbers of leaves, and of leaves that appeared or went since the date before.
         phyllochron: days per leaf that appeared, since the first date.
         total_area: with its standard deviation.
         relative_growth_rate: of the area of those leaves that are measured on this date and the one before, per day,
@@ -91,7 +91,7 @@ class PlantRow:
 
 @dataclass(frozen=True)
 class Growth:
-    """What `measure_growth` finds.
+    """Growth of all leaves and of the plant.
 
     Attributes:
         points: all traits of all tracks on the dates on which they were measured, by track, trait and time.

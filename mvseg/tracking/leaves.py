@@ -100,7 +100,7 @@ class Pair:
         days: between the dates, > 0.
         knows_up: +z is up in both frames.
         scale: what places are measured in, see `Pair.of`.
-        said: (N, M) what a person says of two leaves, as a cost: below 0 they are one, above 0 they are not.
+        said: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
     """
 
     first: DateLeaves

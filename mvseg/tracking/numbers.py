@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SightNumbers:
-    """What a date shows of a leaf."""
+    """Observations of a leaf on a date."""
 
     stations: int = 9  # definition: points of a midrib, base and tip included
     rows: int = 12  # definition: rows of points from base to tip, of edge, midrib and edge
@@ -71,8 +71,8 @@ class LinkNumbers:
 
     most_gap: int = 3  # chosen: max. dates from one sight to another that are compared, so that two may hide a leaf
     unlinked: float = 2.0  # chosen: cost of a pair of leaves up to which one track is cheaper than two
-    said: float = 20.0  # definition: log odds of what a person says, where poses are weighed: more than any leaf's own
-    asked: float = 1e4  # limit: gain of what a person says, above all that leaves can say
+    said: float = 20.0  # definition: log odds of a link of the user, where poses are weighed: more than any leaf's own
+    asked: float = 1e4  # limit: gain of a link of the user, above all that leaves can say
     most_odds: float = 40.0  # limit: log odds, at most, so that their exponentials are numbers
     rounds: int = 10  # limit: rounds of joining anew, at most; two or three are enough
 
@@ -87,9 +87,9 @@ class GrowthNumbers:
 
 @dataclass(frozen=True)
 class PageNumbers:
-    """What a person sees and is asked."""
+    """The page, and its questions."""
 
-    most_questions: int = 10  # definition: questions that a person answers
+    most_questions: int = 10  # definition: questions that the user answers
     least_doubt: float = 0.1  # chosen: probability that a link, or its absence, is wrong, below which nobody is asked
     curve_steps: int = 40  # definition: points of a drawn curve
     side: int = 72  # definition: pixels of a picture of a leaf

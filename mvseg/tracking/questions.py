@@ -1,4 +1,4 @@
-"""What a person is asked about a plant's tracks: the most doubtful links, and what another answer would change."""
+"""What the user is asked about a plant's tracks: the most doubtful links, and what another answer would change."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Question:
     doubt: float
 
     def link(self, tracks: Tracks, *, is_same: bool) -> LeafLink:
-        """A person's answer."""
+        """The user's answer."""
         leaves = tuple((tracks.dates[date].scene, leaf) for date, leaf in (self.before, self.after))
         return LeafLink(is_same, leaves)
 
@@ -70,7 +70,8 @@ def _of_ends(tracks: Tracks) -> Iterator[Question]:
 
 
 def describe_changes(now: Tracks, then: Tracks) -> list[str]:
-    """What is different in other tracks of the same plant, a sentence each; leaves are called as they are now."""
+    """Describe the differences of other tracks of the same plant, a sentence each; leaves are called as they are
+    now."""
     names = {sight: track for track, sights in _sights(now).items() for sight, _ in sights}
     before, after = _earlier_sights(now), _earlier_sights(then)
     changes = []

@@ -89,7 +89,7 @@ class _Run(_Part):
 
 
 def record_plants(plants: Sequence[PlantResults]) -> list[dict[str, Any]]:
-    """What run.json says of them, with absolute paths."""
+    """Entries of run.json about them, with absolute paths."""
     return [
         {"plant": each.plant, "results": [str(path.resolve()) for path in each.folders], "times": list(each.times)}
         for each in plants
@@ -97,7 +97,7 @@ def record_plants(plants: Sequence[PlantResults]) -> list[dict[str, Any]]:
 
 
 def find_plant_links(edits: Sequence[Edit], dates: Sequence[PlantOnDate]) -> tuple[list[LeafLink], dict[int, str]]:
-    """What a person says of the leaves of a plant, and what hinders single edits, see `find_links`."""
+    """Links of the user between leaves of a plant, and problems of single edits, see `find_links`."""
     folders = {date.scene: date.folder for date in dates if date.folder is not None}
     return find_links(edits, folders, {(date.scene, date.leaves[n].leaf) for date in dates for n in date.shaped})
 

@@ -143,7 +143,7 @@ def _link_dates(
 def _without_stems(
     dates: tuple[PlantOnDate, ...], links: Sequence[Association], named: Collection[tuple[str, int]]
 ) -> tuple[PlantOnDate, ...]:
-    """The dates without what looks like a stem wherever it is seen; those (scene, leaf) that a person names stay."""
+    """The dates without what looks like a stem wherever it is seen; those (scene, leaf) that the user names stay."""
     sights = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
     track = {sight: sight for sight in sights}
     for link in links:  # by their earlier sight

@@ -169,7 +169,7 @@ class SparedBoxes:
         return answer
 
     def shares(self, boxes: Tensor) -> Tensor:
-        """(R,) the share of ignored pixels in boxes (R, 4) xyxy, of what lies in the photo."""
+        """(R,) the share of ignored pixels in boxes (R, 4) xyxy, within the photo."""
         height, width = self._sums.shape
         limit = torch.tensor([width - 1, height - 1] * 2, device=boxes.device)
         x1, y1, x2, y2 = torch.minimum(boxes.round().long().clamp(min=0), limit).T

@@ -1,4 +1,4 @@
-"""Results as training samples: masks that `mvseg infer` found and the other views verified, or that a person corrected.
+"""Results as training samples: masks that `mvseg infer` found and the other views verified, or that the user corrected.
 
 What is a label, `are_labels` says. All other masks are ignored, not background.
 """

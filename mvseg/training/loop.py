@@ -62,7 +62,7 @@ Chunk = tuple[list[Tensor], list[Target], list[int]]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What stays the same during a run.
+    """Constants of a run.
 
     Attributes:
         config: the user's options.

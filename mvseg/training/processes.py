@@ -36,7 +36,7 @@ class Processes:
         return self.rank == 0
 
     def ask_first(self, question: Callable[[], T]) -> T:
-        """What `question` returns in the first process, in every process; likewise the InputError that it raises."""
+        """Ask in the first process only; every process gets the answer; likewise the InputError that it raises."""
         answer: list[Any] = [None]
         if self.is_first:
             try:

@@ -30,7 +30,7 @@ LEAST_LEAVES = 3  # chosen: fewer say too little of a species
 
 @dataclass(frozen=True, eq=False)
 class ViewLabels:
-    """What a detector may learn from the photos of V views.
+    """Labels that a detector may learn from the photos of V views.
 
     Attributes:
         leaves: masks that are labels.
@@ -44,7 +44,7 @@ class ViewLabels:
 
     @property
     def num_leaves(self) -> int:
-        """How many leaves have labels; a mask of a person that is matched to nothing is a leaf of its own."""
+        """How many leaves have labels; a mask of the user that is matched to nothing is a leaf of its own."""
         ids = self.leaves.instance_ids
         return len(ids[ids > 0].unique()) + int((ids < 1).sum())
 
@@ -97,10 +97,10 @@ def label_views(masks: Masks, proposals: Masks, photos: ReadPhoto, *, probabilit
 
 
 def are_labels(masks: Masks, probabilities: Mapping[int, float]) -> Tensor:
-    """Which masks to learn from.
+    """Select masks to learn from.
 
     A mask is a label when it likely shows its instance (match score of at least `SURE`), this is likely a leaf (P of at
-    least `LIKELY`; an instance without a P is one), and a detector or a user found it there; or when a person made or
+    least `LIKELY`; an instance without a P is one), and a detector or a user found it there; or when the user made or
     confirmed it. Not learned from are masks that only the other views show, or that one or two views show.
 
     Returns:

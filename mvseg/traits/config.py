@@ -13,7 +13,7 @@ Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that 
 
 @dataclass(frozen=True)
 class TraitsConfig:
-    """Which instances count as leaves; the others keep shapes and ids, and the table gives the reason.
+    """Choice of the instances that count as leaves; the others keep shapes and ids, and the table gives the reason.
 
     Attributes:
         min_sure_views: views with a sure match (match score of 0.5 or more) that a leaf needs; it has no effect where

@@ -85,7 +85,7 @@ def find_rejected(
         sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
         visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
             surface.
-        stems: {instance id: how likely it is a stem}, of those that are long.
+        stems: {instance id of a long instance: probability that it is a stem}.
 
     Returns:
         {instance id: why}: the gravest of several reasons, see `Kind`.
@@ -117,13 +117,13 @@ def find_rejected(
 
 
 def median_iou(surface: LeafSurface) -> float:
-    """Of a surface with its masks; 0 where that is not known."""
+    """Median IoU of a surface with its masks; 0 where that is not known."""
     iou = surface.iou[surface.iou.isfinite()]
     return float(iou.median()) if len(iou) else 0.0
 
 
 def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
-    """What lies below everything else, and is far larger than anything else."""
+    """Find the floor: it lies below everything else, and is far larger."""
     if len(bodies) < FEWEST:
         return {}
     tops = {instance: float((body.points @ up).max()) for instance, body in bodies.items()}
@@ -139,7 +139,7 @@ def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
 
 
 def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
-    """Those that no chain of short steps, from instance to instance, joins with most of the others."""
+    """Find instances that no chain of short steps, from instance to instance, joins with most of the others."""
     if len(bodies) < FEWEST:
         return {}
     length = sorted(body.length for body in bodies.values())[-2]  # the longest one may be what lies beside the plant

@@ -30,7 +30,7 @@ FIRST_NODE = missing("not measured: the lowest node has none below")
 
 @dataclass(frozen=True)
 class Node:
-    """Where one leaf joins a stem.
+    """Place where one leaf joins a stem.
 
     Attributes:
         number: 1 for the lowest one of its stem.

@@ -46,7 +46,7 @@ LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter o
 def find_tubes(
     surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, stems: Collection[int], is_asked: bool
 ) -> dict[int, TubeEvidence]:
-    """{instance id: evidence that it is a stem} of those that are `stems`, as the user says, and of the others that are
+    """Evidence by instance id: of `stems`, as the user says, and of the others that are
     slender enough to be one, if that `is_asked`."""
     regions, ids = masks.regions, masks.instance_ids
     known = {instance: surface for instance, surface in surfaces.items() if instance in stems}

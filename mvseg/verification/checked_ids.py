@@ -42,7 +42,7 @@ def check_ids(
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
-            a person corrected or linked keep their ids.
+            the user corrected or linked keep their ids.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         config: that the masks were matched with.
 
@@ -74,7 +74,7 @@ def find_shared(
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 
-    Half of what the view shows of the second one must lie in the mask, or the matcher must have named the two: a
+    Half of the image of the second one must lie in the mask, or the matcher must have named the two: a
     mask that is drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The
     second part is what is nearer to what is seen of the second surface than to what is seen of the first.
 

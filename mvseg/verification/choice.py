@@ -42,7 +42,7 @@ class Step:
 
     @property
     def shown(self) -> float:
-        """Of what the views must show of it, the share that its masks show, see `leaf_features`."""
+        """Share of its expected area that its masks show, see `leaf_features`."""
         return float(self.features[1])
 
 
@@ -81,12 +81,12 @@ class Said:
 
     @staticmethod
     def nothing(num_masks: int) -> Said:
-        """Of any mask."""
+        """Statements about no mask."""
         return Said(np.zeros(num_masks, bool), np.zeros(num_masks, bool), np.full(num_masks, -1))
 
     @staticmethod
     def of(num_masks: int, rows: Ints, *, is_held: Tensor, is_sure: Tensor, leaf: Tensor) -> Said:
-        """Of some rows of a table."""
+        """Statements about some rows of a table."""
         said = Said.nothing(num_masks)
         said.is_held[rows], said.is_sure[rows], said.leaf[rows] = is_held, is_sure, leaf
         return said
@@ -129,7 +129,7 @@ class _Ranked:
 
     @property
     def chances(self) -> Floats:
-        """(L,) P of the leaves; 1 of those that stay."""
+        """(L,) P of the leaves; 1 where the user says so."""
         chance = {each.candidate: each.chance for each in self.steps}
         return np.where(self.stays, 1.0, [chance[leaf] for leaf in self.leaves.tolist()])
 
@@ -230,7 +230,7 @@ def rank(
 
 
 def least_chance(chances: Floats) -> float:
-    """From which chance on to take things, for the largest expected F1 of what is taken against what is right: with n
+    """From which chance on to take things, for the largest expected F1: with n
     taken, 2 sum(chances taken) / (n + sum(all chances)). Nothing is tuned here, and it is never above one half.
 
     Args:

@@ -42,7 +42,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Leaves:
-    """What was chosen.
+    """Accepted leaves.
 
     Attributes:
         masks: D' masks on the CPU, by view and instance, with ids from 1 on, the likeliest leaf first; match scores are
@@ -51,7 +51,7 @@ class Leaves:
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
         left: the candidates that were not chosen, the most likely first.
-        agreement: of what the views must show of a leaf, the share that its masks show; mean over the leaves that have
+        agreement: share of a leaf's expected area that its masks show; mean over the leaves that have
             a surface, NaN without any. Pieces of leaves, whose ids mix, have little.
     """
 
@@ -76,16 +76,16 @@ def choose_leaves(
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
-    Masks that a person corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
-    that no detector found. What else lies there goes, and what the person took away does not come back. All other
+    Masks that the user corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
+    that no detector found. What else lies there goes, and what the user took away does not come back. All other
     candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. Where
     all that edits say of a leaf holds already, its candidate is one of these.
 
     Args:
-        matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
+        matched: D masks, matched; `labels` of detected ones are rows of `proposals`.
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
         more: masks of other matchings, of more of the proposals, with such labels, too.
-        gone: masks that a person took away; None: nobody edited the masks. Otherwise only the instances of a person's
+        gone: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the user's
             masks are candidates here, and `more` has the others.
         seen: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1 elsewhere.
             None: for none.
@@ -103,7 +103,7 @@ def choose_leaves(
     is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
     is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # an edit only says which leaf it does not show
     is_sure = is_held & ~is_apart
-    is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # a person's, and what was cut since
+    is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # the user's, and what was cut since
     added = matched.select(is_added)
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
@@ -131,7 +131,7 @@ def choose_leaves(
 
 
 def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
-    """The table with what a person said of the matched masks that are in it."""
+    """The table with what the user said of the matched masks that are in it."""
     origin, is_linked = table.origin.clone(), table.is_linked.clone()
     origin[row_of], is_linked[row_of] = matched.origin, matched.is_linked
     return replace(table, origin=origin, is_linked=is_linked)

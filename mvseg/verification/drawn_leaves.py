@@ -1,9 +1,9 @@
-"""Masks, in all other views, of the leaves that a person drew in two or more.
+"""Masks, in all other views, of the leaves that the user drew in two or more.
 
 Two outlines leave a surface's tilt open. The other views close it: what has the colour of leaves there, and is in no
 mask of another leaf, is the leaf itself wherever the points that both outlines allow come to lie in it. The surface
-is fitted to those parts as well, and then says what each view shows of the leaf. Half masks of the leaf, which no
-person drew, go: they would make it half a surface. Not in the paper.
+is fitted to those parts as well, and then says what each view shows of the leaf. Half masks of the leaf, which the user
+did not draw, go: they would make it half a surface. Not in the paper.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mvseg.verification.rough_surfaces import median_parallax
 
 Frame = NDArray[np.bool_]
 
-HULL = ReconstructConfig(voxel_budget=25_000)  # of what outlines allow; a limit of time
+HULL = ReconstructConfig(voxel_budget=25_000)  # of the volume that outlines allow; a limit of time
 COLUMNS = ("view_index", "boxes", "crops", "labels")
 
 
@@ -47,7 +47,7 @@ def follow_drawn(
     colors: Frame | None = None,
     cache: SurfaceCache | None = None,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
-    """Give the leaves that a person drew a mask in each other view that shows them openly.
+    """Give the leaves that the user drew a mask in each other view that shows them openly.
 
     That is where at least `DRAWN.least_visible` of the leaf's surface, and `EVIDENCE.open_pixels`, lie in no mask of
     another leaf, and `DRAWN.least_colored` of it have the colour of leaves. There, a mask that was matched to nothing
@@ -55,13 +55,13 @@ def follow_drawn(
     photos, it takes the place of half masks of the leaf, see `_drop_halves`.
 
     Args:
-        masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
+        masks: D masks, matched; those that the user drew have `Origin.CORRECTED`.
         photos: of the views. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
 
     Returns:
         The D masks on the CPU in their order, without half masks, and the new ones after them. And {instance id:
-        surface} of the leaves that were looked for; none of those that are not credible, which get no masks.
+        surface} of the leaves that were looked for and are credible.
     """
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
     drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
@@ -86,7 +86,7 @@ def follow_drawn(
 
 
 def _is_followed(masks: Masks, leaf: int) -> bool:
-    """Whether a leaf has masks in several views, and none, or others than a person's, in others."""
+    """Whether a leaf has masks in several views, and none, or others than the user's, in others."""
     is_own = masks.instance_ids == leaf
     return bool(_views_without(masks, leaf)) or bool((is_own & ~masks.is_corrected & ~masks.is_linked).any())
 
@@ -97,8 +97,8 @@ def _views_without(masks: Masks, leaf: int) -> list[int]:
 
 
 def _maybe_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras) -> Tensor:
-    """(D,) bool: which masks of a leaf may show half of it: those that no person drew, confirmed or linked, and where
-    enough more has the colour of leaves and is in no mask of another leaf. None where a person drew the leaf in one
+    """(D,) bool: which masks of a leaf may show half of it: those that no user drew, confirmed or linked, and where
+    enough more has the colour of leaves and is in no mask of another leaf. None where the user drew the leaf in one
     view only. (Without such masks, no surface need be fitted.)"""
     is_own = masks.instance_ids == leaf
     maybe = is_own & ~masks.is_corrected & ~masks.is_linked
@@ -173,7 +173,7 @@ def _fit(
 
 
 def _find_parts(left: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
-    """{view: what may be a leaf's there}: the largest part of what is left around its place."""
+    """{view: largest remaining part around the leaf's place}."""
     found = {}
     for view in left:
         place = Crop.of(left[view] & around[view]) if (left[view] & around[view]).any() else None
@@ -225,7 +225,7 @@ def _find_open(
 
 
 def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
-    """(H, W) bool: what masks of other instances, or that a person drew, show."""
+    """(H, W) bool: what masks of other instances, or that the user drew, show."""
     is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected)
     width, height = cameras.sizes[view].tolist()
     return masks.regions.label_map(view, is_other.long(), (width, height)) > 0

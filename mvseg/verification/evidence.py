@@ -71,7 +71,7 @@ class Evidence:
             lies in front.
         inside: (D, K) share of the mask that lies in the part that nothing nearer hides.
         within: (D, K) share of the mask that lies in the surface as if nothing hid that.
-        share: (V, K) of what the view shows of the surface, that nothing hides; 0 where it shows nothing.
+        share: (V, K) unhidden share of the surface's image; 0 where it has none.
     """
 
     visible: Floats

@@ -45,7 +45,7 @@ def count_colors(photo: np.ndarray, is_inside: np.ndarray) -> ColorCounts:
 def leaf_colors(counts: ColorCounts) -> np.ndarray:
     """(bins, bins, bins) bool: colours that are more frequent inside than outside, each as a share of its side.
 
-    Leaves that were missed are counted outside. As long as they are a small part of what is outside, their colours are
+    Leaves that were missed are counted outside. As long as they are a small part of it, their colours are
     rarer there than inside. No colour is a leaf's when nothing is inside.
     """
     inside, outside = (

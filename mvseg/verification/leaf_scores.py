@@ -52,7 +52,7 @@ class Candidates:
     Attributes:
         surfaces: K, None where the masks of one agree on none.
         matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
-        certain: (D, K) bool: a person says that the mask shows the candidate.
+        certain: (D, K) bool: the user says that the mask shows the candidate.
         stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 without a surface.
     """
 
@@ -66,7 +66,7 @@ class Candidates:
 
     @property
     def is_certain(self) -> Bools:
-        """(K,) those that a person says are leaves."""
+        """(K,) those that the user says are leaves."""
         return np.asarray(self.certain.any(0), bool)
 
     @cached_property
@@ -92,7 +92,7 @@ class Candidates:
 
 @dataclass(frozen=True, eq=False)
 class ClearLeaves:
-    """What the clear leaves of one plant are like, by which its other candidates are judged: a plant that the detector
+    """Measures of the clear leaves of one plant, by which its other candidates are judged: a plant that the detector
     has not learned scores low everywhere.
 
     Attributes:
@@ -106,7 +106,7 @@ class ClearLeaves:
 
 def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
-    masks that were matched to a candidate can; what a person says is certain."""
+    masks that were matched to a candidate can; what the user says is certain."""
     q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
     q = np.where(np.isnan(candidates.matched), 0.0, q)
     with_surface = candidates.has_surface
@@ -131,7 +131,7 @@ def matched_features(matched: Floats, scores: Floats) -> Floats:
 
 
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(K,) P: how likely each candidate is a leaf, and no stem; 1 where a person says so."""
+    """(K,) P: how likely each candidate is a leaf, and no stem; 1 where the user says so."""
     by_surface = expit(features @ list(fitted.leaf.values()))
     by_masks = expit(features[:, : len(fitted.found)] @ list(fitted.found.values()))
     chances: Floats = np.where(candidates.has_surface, by_surface * (1 - candidates.stem), by_masks)

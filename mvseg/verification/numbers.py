@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvidenceNumbers:
-    """What surfaces say of masks."""
+    """Evidence of surfaces for masks."""
 
     most_px: int = 800  # limit: longer side of the photos on which masks are compared, at most
     fits: float = 0.5  # definition: IoU with what a view shows of a leaf from which a mask shows the leaf
@@ -52,7 +52,7 @@ class ChoiceNumbers:
 
     rounds: int = 2  # limit: in the first nothing hides anything, in the second the leaves of the first do
     same: float = 0.8  # chosen: Jaccard index of the masks of two candidates, by area, above which they are one
-    clear: float = 0.6  # chosen: share of what views must show of a candidate from which it is a clear leaf
+    clear: float = 0.6  # chosen: shown share of its expected area from which a candidate is a clear leaf
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
     least_shown: float = 0.2  # chosen: q from which a mask may show a leaf
     least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
@@ -61,11 +61,11 @@ class ChoiceNumbers:
 
 @dataclass(frozen=True)
 class DrawnNumbers:
-    """What other views show of leaves that a person drew."""
+    """Search for leaves that the user drew, in other views."""
 
     least_visible: float = 0.3  # chosen: unhidden fraction of a surface that a view sees openly; see `open_pixels`
     least_colored: float = 0.8  # chosen: fraction of the unhidden part that has the colour of leaves, at least
-    half: float = 0.5  # definition: a mask shows half a leaf if it covers less of what its view shows of the surface
+    half: float = 0.5  # definition: a mask shows half a leaf if it covers less of the surface's image
     rounds: int = 2  # limit: fits: the second one is to what is found where the surface of the first one is
     beside_px: int = 2  # chosen: pixels between leaf colour and where a view may show a leaf, at most
     most_against: float = 0.15  # chosen: fraction of views with another colour at a point: stakes hide leaves

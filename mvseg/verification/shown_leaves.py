@@ -1,4 +1,4 @@
-"""Which leaf does each given mask show? Asked of surfaces, as `choose.py` asks it of what a detector found.
+"""Which leaf does each given mask show? Asked of surfaces, as `choose.py` asks it of proposals.
 
 That a given mask shows a leaf is certain. So there is one question, of every mask and every candidate: does this mask
 show that surface (q)? Each mask goes where the answer is the surest, if that is likelier than where it was
@@ -52,7 +52,7 @@ GIVEN = GivenScores(
 
 @dataclass(frozen=True, eq=False)
 class MaskQuestion:
-    """Which of K candidates does each of D given masks show?
+    """Question: which of K candidates does each of D given masks show?
 
     Attributes:
         masks: on the CPU.
@@ -103,7 +103,7 @@ def ask(
     fitted: GivenScores = GIVEN,
     cache: SurfaceCache | None = None,
 ) -> MaskQuestion:
-    """What to ask of D matched masks on the CPU, also of the instances that the matcher finds once more."""
+    """Question about D matched masks on the CPU, also of the instances that the matcher finds once more."""
     first = MaskQuestion.of(masks, surfaces, cameras, is_held=is_held)
     odds = show_odds(first, fitted)[np.arange(len(masks)), first.leaf]
     more = match_again(masks, first.leaf, odds=odds, cameras=cameras, config=config)

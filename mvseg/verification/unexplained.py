@@ -1,4 +1,4 @@
-"""How much of what looks like leaves no mask explains: where it is most of it, leaves were missed. Not in the paper."""
+"""Leaf-coloured area in no mask: where it is most of it, leaves were missed. Not in the paper."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mvseg.verification.numbers import COLORS, EVIDENCE
 
 
 def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
-    """Of all pixels that are in masks, or have the colours of these, the share that is in none; 0 without any.
+    """Share of the leaf-coloured area that is in no mask; 0 without any.
 
     Args:
         masks: D masks, those of leaves with an id.
@@ -35,7 +35,7 @@ def find_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> Findi
 
     Args:
         masks, photos: see `share_unexplained`.
-        sure_score: detection score of what the detector is sure of.
+        sure_score: detection score from which the detector is sure.
     """
     if not (masks.instance_ids > 0).any():
         return Finding("no_leaves")

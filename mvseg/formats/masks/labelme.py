@@ -34,7 +34,7 @@ class _Shape(BaseModel):
 
 
 class LabelmeFile(BaseModel):
-    """What a labelme file holds."""
+    """Content of a labelme file."""
 
     shapes: Items[_Shape]
     imageWidth: int | None = None

@@ -39,7 +39,7 @@ def stack_views(
     Returns:
         Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks that are left out: those
         without pixels, empty or not shown by the undistorted photo, and those that stand twice in one view, or nearly
-        (`SAME`); of what `check_numbers` finds in label maps; and of what `mask_faults` finds in masks of a scene.
+        (`SAME`), and of findings of `check_numbers` in label maps and of `mask_faults` in masks of a scene.
 
     Raises:
         InputError: there are masks, and none has a pixel; or see `check_numbers`.

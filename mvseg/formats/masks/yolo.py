@@ -84,7 +84,7 @@ def _read_line(words: Sequence[str], number: int, size: tuple[int, int], *, name
 
 
 def name_files(folder: Path) -> list[Path]:
-    """Where the names of the classes of a folder of masks may stand; the first that is there is read."""
+    """List files that may hold the names of the classes of a folder of masks; the first that is there is read."""
     return [place / name for place in (folder, folder.parent, folder.parent.parent) for name in NAME_FILES]
 
 

@@ -34,7 +34,7 @@ Key = TypeVar("Key")
 
 @dataclass(frozen=True, eq=False)
 class ViewGains:
-    """What the N regions of one view would gain by joining the K clusters that the other views form.
+    """Gains of the N regions of one view from joining the K clusters that the other views form.
 
     Attributes:
         clusters: (K,) int64, their numbers.
@@ -94,7 +94,7 @@ class ClusterScores:
         return self._score_pixels(view, self._members_elsewhere(view, numbers))
 
     def coverages(self, clusters: Clusters) -> Floats:
-        """Where clusters expect to be seen in each view, R(c, n).
+        """Pixels where clusters expect to be seen in each view, R(c, n).
 
         Returns:
             (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best hypothesis shows
@@ -119,7 +119,7 @@ class ClusterScores:
         return own
 
     def value(self, clusters: Clusters) -> float:
-        """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
+        """Value of a partition: the scores of all regions that are not alone, and the epipolar evidence for all
         pairs in one cluster."""
         pairs = self.pair_factor * float(self.graph.sum_partners(self.evidence, clusters).sum()) / 2
         return float(self.own(clusters)[~clusters.is_alone].sum()) + pairs
@@ -137,7 +137,7 @@ class ClusterScores:
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
     def gains(self, view: int, numbers: Ints, coverages: Floats) -> ViewGains:
-        """What the regions of one view would gain by joining the clusters of the other views.
+        """Gains of the regions of one view from joining the clusters of the other views.
 
         Args:
             numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out.
@@ -320,7 +320,7 @@ def best_elsewhere(
 def _look_up(
     cache: dict[Key, Floats], keys: list[Key], compute: Callable[[list[int]], Iterable[Floats]]
 ) -> list[Floats]:
-    """What is cached for the keys; `compute` gives it for the places of those that are not there yet."""
+    """What is cached for the keys; `compute` gives it for the places of missing ones."""
     new = [place for place, key in enumerate(keys) if key not in cache]
     if new:
         cache.update(zip((keys[place] for place in new), compute(new), strict=True))

@@ -37,7 +37,7 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
     E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
     regions that they name (the pixel's own included), less `EM.empty_cost` for views that show nothing. With many
     views, `EM.views` of them are compared with each other. M step: the affinity of region n to m is the belief in
-    hypotheses with m, averaged over the pixels of n, and made symmetric. What a person knows of two regions is 1 or 0
+    hypotheses with m, averaged over the pixels of n, and made symmetric. What the user knows of two regions is 1 or 0
     after each step: hypotheses that show linked regions are believed, and with them all else that these show.
 
     Args:

@@ -76,7 +76,8 @@ def _shared_in_view(
 
 
 def second_part(scores: ClusterScores, clusters: Clusters, regions: Regions, *, region: int, second: int) -> Tensor:
-    """Where a merged mask shows its second instance: where its cluster explains the nearest sampled pixels better.
+    """Part of a merged mask that shows its second instance: where its cluster explains the nearest sampled pixels
+    better.
 
     Args:
         scores: of D regions, ordered by view.

@@ -26,7 +26,7 @@ def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Fl
     """Strangers leave their clusters and are alone.
 
     Returns:
-        The clusters, those of one region included. What a person joined stays. And (D,) float64: how likely each region
+        The clusters, those of one region included. What the user joined stays. And (D,) float64: how likely each region
         that is still a piece shows the leaf of its cluster; 1 for all others.
     """
     chance = np.ones(len(clusters.ids))

@@ -36,7 +36,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ViewBounds:
-    """Where each view starts in a `PlaneSweep`: (V + 1,) offsets of its regions, pixels and hypotheses."""
+    """Places where each view starts in a `PlaneSweep`: (V + 1,) offsets of its regions, pixels and hypotheses."""
 
     region_starts: Ints
     pixel_starts: Ints
@@ -80,7 +80,7 @@ class PlaneSweep:
 
     @cached_property
     def bounds(self) -> ViewBounds:
-        """Where each view starts in the sweep."""
+        """Places where each view starts in the sweep."""
         numbers = np.arange(self.num_views + 1)
         pixel_starts = np.searchsorted(self.view_index[self.pixel_region], numbers)
         return ViewBounds(
@@ -100,7 +100,7 @@ class PlaneSweep:
         return pack_views(self.labels == EMPTY)
 
     def hypotheses_of_regions(self, view: int) -> HypothesesOfRegions:
-        """Which hypotheses on rays of one view name which regions; cached for the next call."""
+        """Hypotheses on rays of one view by the regions that they name; cached for the next call."""
         if view not in self._hypotheses_of_regions:
             labels = self.labels[self.bounds.hypotheses(view)]
             self._hypotheses_of_regions[view] = index_hypotheses(labels, len(self.view_index))

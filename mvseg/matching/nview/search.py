@@ -66,7 +66,7 @@ def refine_clusters(scores: ClusterScores, clusters: Clusters, *, join_fragments
             chosen = assign_one_to_one(gains.total, 0.0)
             if join_fragments:
                 is_free = np.ones(movers.num, bool)
-                is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False  # as a person says
+                is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False  # as the user says
                 chosen = _join_fragments(chosen, gains, is_free=is_free)
             fresh = ids.max() + 1 + np.arange(len(chosen))
             ids[movers.rows] = np.append(gains.clusters, fresh)[chosen][movers.owner]
@@ -82,7 +82,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     Fragments of over-segmented masks, and masks that are merged with something else, find each other across views and
     form spurious instances. A region of such a cluster joins the larger one that covers most of it and explains some of
     it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
-    dissolved, and never what a person has linked.
+    dissolved, and never what the user has linked.
     """
     sweep = scores.sweep
     is_shown = np.zeros((len(clusters), sweep.num_views), bool)

@@ -83,7 +83,7 @@ def fit_tube(masks: MaskStack, start: Floats | None = None, *, mask_sd_px: float
 
 
 def believe_offsets(measured: Floats, sd_px: float) -> Floats:
-    """(S,) by how much the mask of each view is too large, of what is measured (S,), NaN for nothing: the part that is
+    """(S,) by how much the mask of each view is too large, from offsets (S,), NaN for nothing: the part that is
     likely where masks differ by this standard deviation."""
     finite = measured[np.isfinite(measured)]
     if not len(finite):

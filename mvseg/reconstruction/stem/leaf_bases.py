@@ -46,12 +46,12 @@ class LeafBases:
         return len(self.ids)
 
     def select(self, keep: NDArray) -> LeafBases:
-        """Those at an index (M,), or where `keep` (N,) is true."""
+        """Select bases at an index (M,), or where `keep` (N,) is true."""
         return LeafBases(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
 
     @staticmethod
     def join(first: LeafBases, second: LeafBases) -> LeafBases:
-        """Those of both."""
+        """Join two sets of bases."""
         names = [field.name for field in fields(LeafBases)]
         return LeafBases(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
 
@@ -104,7 +104,7 @@ class BaseAxis:
 
 
 def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tuple[BaseAxis, ...]:
-    """Find the axes that the leaves of a plant point back to: of the most leaves first, then of those that are left.
+    """Find the axes that the leaves of a plant point back to: that of the most leaves first.
 
     Args:
         surfaces: {instance id: surface} of leaves.
@@ -268,7 +268,7 @@ def _fit_axis(
 
 
 def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
-    """Of each leaf the end that is nearer to a curve (P, 3)."""
+    """Choose the end of each leaf that is nearer to a curve (P, 3)."""
     gaps = [np.linalg.norm(each.points[:, None] - curve, axis=2).min(1) for each in (first, second)]
     is_second = gaps[1] < gaps[0]
     chosen = {}
@@ -279,7 +279,7 @@ def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases
 
 
 def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floats]:
-    """Where the rays back from the bases pass a curve (P, 3), which leads upwards.
+    """Project bases along their rays back to a curve (P, 3), which leads upwards.
 
     A ray goes back from the base by at most `AXES.longest_petiole` of the leaf's length. Petioles bend down under their
     blades: they come from somewhat lower than the midrib points back to.

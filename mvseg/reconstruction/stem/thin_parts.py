@@ -59,7 +59,7 @@ def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world
     hidden = cv2.resize(is_leaf[part].astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0
     hidden = cv2.dilate(hidden.astype(np.uint8), np.ones((2 * THIN.beside_px + 1,) * 2, np.uint8)) > 0
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-    if hidden.any() and not hidden.all():  # leaves take the colour of what is next to them
+    if hidden.any() and not hidden.all():  # leaves take the colour next to them
         lab = lab[tuple(distance_transform_edt(hidden, return_distances=False, return_indices=True))]
     around = cv2.medianBlur(lab, 2 * THIN.around_px + 1)
     apart = np.sqrt(((lab.astype(np.float32) - around) ** 2).sum(2))

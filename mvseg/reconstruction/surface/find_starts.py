@@ -126,7 +126,7 @@ def _try_starts(
 
 
 def area_cost(coefficients: Floats) -> float:
-    """What is taken off the rank of a patch before it is compared with others."""
+    """Cost of its area that lowers the rank of a patch."""
     return SEARCH.area_cost * float(np.log(measure_sizes(coefficients)[0]))
 
 
@@ -135,7 +135,7 @@ def _area_costs(patches: Floats) -> Floats:
 
 
 def wide_cost(coefficients: Floats) -> Floats:
-    """What the rank of a patch, or of several (..., 26, 3), loses for being wider than long."""
+    """Cost for the rank of a patch, or of several (..., 26, 3), that is wider than long."""
     size = measure_patch(coefficients)
     return np.where(2 * size.half_width > size.length, SEARCH.wide_cost, 0.0)
 

@@ -140,7 +140,7 @@ class _Equations:
     noise: Floats
 
     def of_leaf(self, leaf: int) -> _Equations:
-        """Those of one patch."""
+        """State of one patch."""
         keep = self.distances.leaf == leaf
         return _Equations(self.distances.of_leaf(leaf), self.px[keep], self.weight[keep], self.noise[[leaf]])
 

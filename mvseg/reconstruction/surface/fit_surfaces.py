@@ -203,7 +203,7 @@ def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
 def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:
     """The masks that show each leaf, and a fit from a start that is nearly right or from those that are found.
 
-    Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
+    Of several fits the best one, and how far the areas of nearly as good ones are from its own.
     """
     searched = iter(find_starts([each.masks for each in asked if each.start is None], is_rough=is_rough))
     given = [next(searched) if each.start is None else (each.masks, [each.start]) for each in asked]

@@ -59,7 +59,7 @@ def find_quarters(px_from_world: Floats, middle: Floats, axes: Floats) -> Ints:
     """(S, 2, 2) of -1, 0 and 1: a turn of each photo by quarters, or its mirror image.
 
     Afterwards the longest of the axes, as the photo shows it, points to the right rather than up or down, and all
-    photos are mirror images of what right-handed axes would show, or none is.
+    photos are mirror images of photos with right-handed axes, or none is.
     """
     cam = px_from_world[:, :, :3] @ middle + px_from_world[:, :, 3]
     matrix = px_from_world[:, :, :3] @ axes.T

@@ -114,7 +114,7 @@ def grid_vertices(points: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PatchSize:
-    """What the prior and the steps of the fit are measured by: length of the midrib and largest half-width, of one
+    """Units of the prior and of the steps of the fit: length of the midrib and largest half-width, of one
     patch or of several (...)."""
 
     length: Floats
@@ -130,7 +130,7 @@ def measure_patch(coefficients: Floats) -> PatchSize:
 
 
 def patch_prior(coefficients: Floats, size: PatchSize, *, noise: Floats | float) -> tuple[Floats, Floats]:
-    """What is expected of leaves, as linear equations about the present coefficients.
+    """Prior of leaves, as linear equations about the present coefficients.
 
     Directions (along the midrib, normal) are those of the present patch, so the answer does not depend on how the
     world is turned.

@@ -131,7 +131,7 @@ class LeafSurface:
         return area, length, width
 
     def deviation(self, measure: Callable[[Floats], Floats]) -> Floats:
-        """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
+        """Standard deviations of measures of the surface: those of the coefficients, propagated linearly.
 
         Args:
             measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It gets
@@ -186,9 +186,9 @@ class LeafSurface:
         ]
 
     def project_parts(self, cameras: Cameras) -> list[Crop]:
-        """What `project` shows, as V crops on the CPU; empty ones where the surface is not in the view.
+        """Project as V crops on the CPU; empty ones where the surface is not in the view.
 
-        Drawn once for the same camera: many stages ask, and so does each edit of a person.
+        Drawn once for the same camera: many stages ask, and so does each edit of the user.
         """
         cameras = cameras.to("cpu")
         poses, sizes = cameras.px_from_world.numpy(), cameras.sizes.numpy()

@@ -36,7 +36,7 @@ class MaskErrors:
         return self.sd_px**2 / (self.sd_px**2 + ERRORS.measured_px**2)
 
     def centre(self, offsets: Floats) -> tuple[float, float]:
-        """Where offset 0 lies among the offsets (S,) of one leaf, in pixels, and its standard deviation.
+        """Place of offset 0 among the offsets (S,) of one leaf, in pixels, and its standard deviation.
 
         Mean and deviation of the posterior over all places between the smallest and the largest offset.
         """

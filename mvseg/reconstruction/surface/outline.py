@@ -46,7 +46,7 @@ class OutlineSamples:
     depth: Floats
 
     def select(self, keep: NDArray) -> OutlineSamples:
-        """Those at places (N,), or where `keep` (K,) is true."""
+        """Select samples at places (N,), or where `keep` (K,) is true."""
         places = np.flatnonzero(keep) if keep.dtype == bool else keep
         return OutlineSamples(*(getattr(self, field.name).take(places, 0) for field in fields(self)))
 
@@ -104,7 +104,7 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     px, depth, is_front = projection.px.reshape(-1, 2), projection.depth.ravel(), grid_orientations(projection.px) > 0
 
     def middles(corner: NDArray) -> Floats:
-        """Of quads with this first corner."""
+        """Middles of quads with this first corner."""
         quad: Floats = px[corner + columns + 1] + px[corner] + px[corner + columns] + px[corner + 1]
         return quad / 4
 
@@ -164,7 +164,7 @@ class Distances:
     num_leaves: int
 
     def of_leaf(self, leaf: int) -> Distances:
-        """Those of one patch."""
+        """Samples of one patch."""
         keep = self.leaf == leaf
         names = "stack", "px", "place", "gradient", "weight", "leaf"
         return replace(self, **{name: getattr(self, name)[keep] for name in names})

@@ -165,7 +165,7 @@ def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.floa
 
 
 def select_hiding(masks: MaskStack, points: Floats, others: Mapping[int, Floats]) -> dict[int, Floats]:
-    """Those of the others that can change an answer of `hiding_pixels`: in some view, their grid or a pixel that shows
+    """Select the others that can change an answer of `hiding_pixels`: in some view, their grid or a pixel that shows
     them comes near the leaf's grid or mask."""
     px = project_points(masks.px_from_world, points).px.reshape(len(masks), -1, 2)
     low, high = px.min(1), px.max(1)

@@ -39,7 +39,7 @@ class Approach:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceCache:
-    """What was fitted; `fit_surfaces` looks here first, and adds to it.
+    """Surfaces that were fitted; `fit_surfaces` looks here first, and adds to it.
 
     Attributes:
         approaches: {name of a first fit: what it found}; None where masks agree on no point.

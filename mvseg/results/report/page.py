@@ -95,7 +95,8 @@ def describe_masks(result: Result, pictures: Sequence[Picture]) -> list[list[dic
 
 
 def describe_update(result: Result, pictures: Sequence[Picture]) -> dict[str, Any]:
-    """What the mode "Correct" shows anew of a result of the same photos; for `pictures` see `Picture.with_masks`."""
+    """Data that the mode "Correct" shows anew of a result of the same photos; for `pictures` see
+    `Picture.with_masks`."""
     return {
         "views": [{"masks": masks} for masks in describe_masks(result, pictures)],
         "leaves": describe_leaves(result),

@@ -70,7 +70,7 @@ class Picture:
     outlines: list[MaskContour]
 
     def as_json(self) -> dict[str, Any]:
-        """What the page reads, except for the masks; JPEGs in base64."""
+        """Data that the page reads, except for the masks; JPEGs in base64."""
         return {
             "jpeg": base64.b64encode(self.jpeg).decode("ascii"),
             "thumbnail": base64.b64encode(self.thumbnail).decode("ascii"),
@@ -114,7 +114,7 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
 
 def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
-    that the picture shows (`box`, xyxy, pixels), too: a person may look for them."""
+    that the picture shows (`box`, xyxy, pixels), too: the user may look for them."""
     regions, others = masks.regions, masks.second_ids.tolist()
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]

@@ -55,7 +55,7 @@ class TrackWork {
     });
   }
 
-  // --- what a person says
+  // --- what the user says
 
   click(leaf) {
     const { sight } = this;

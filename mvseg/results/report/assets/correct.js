@@ -1,4 +1,4 @@
-// The mode "Correct": two photos side by side, what a person picks and draws in them, and what they say of it.
+// The mode "Correct": two photos side by side, what the user picks and draws in them, and what they say of it.
 
 const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
   u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area", t: "learn" };
@@ -235,7 +235,7 @@ class Work {
     return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, `offered ${number}`));
   }
 
-  // An outline that a person draws: the answer to a question shows what that asks about, in its photo.
+  // An outline that the user draws: the answer to a question shows what that asks about, in its photo.
   drawnEdits(view, points, leaf) {
     const { doubt } = this;
     if (doubt?.kind === "leaf" && !leaf) {
