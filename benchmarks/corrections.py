@@ -97,7 +97,7 @@ def correct(case: Case) -> tuple[list[tuple[int, float, float]], int]:
     while True:
         result = compute(case, Corrections(edits))
         masks = result.masks.to("cpu")
-        doubts = list_doubts(masks, result.surfaces, cameras=result.scene.cameras, left=result.left)
+        doubts = list_doubts(masks, result.surfaces, cameras=result.scene.cameras, rejected=result.rejected)
         look = Look(masks, case.truth, result.scene, doubts)
         whole = leaf_metrics(masks.regions, masks.instance_ids, case.truth)
         rounds.append((len(done), whole.mv_pq, whole.num_right / max(whole.num_right + whole.num_missed, 1)))

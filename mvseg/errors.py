@@ -47,12 +47,12 @@ class InputWarning(UserWarning):
         return finding
 
 
-def warn(said: Finding | Warning) -> None:
+def warn(finding: Finding | Warning) -> None:
     """Warn (InputWarning) as of the line outside of this package that led here; one that was caught is repeated."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mvseg."):
         frame, level = frame.f_back, level + 1
-    warnings.warn(InputWarning(said) if isinstance(said, Finding) else said, stacklevel=level)
+    warnings.warn(InputWarning(finding) if isinstance(finding, Finding) else finding, stacklevel=level)
 
 
 @contextmanager

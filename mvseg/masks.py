@@ -145,10 +145,10 @@ class Masks:
         rows = enumerate(zip(self.instance_ids.tolist(), self.second_ids.tolist(), self.second_parts, strict=True))
         return tuple(MergedMask(row, own, other, part) for row, (own, other, part) in rows if part is not None)
 
-    def with_merged(self, found: Iterable[MergedMask]) -> Masks:
-        """The same masks, of which those `found`, and no others, seem to show two instances."""
+    def with_merged(self, merged: Iterable[MergedMask]) -> Masks:
+        """The same masks, of which those `merged`, and no others, seem to show two instances."""
         ids, parts = torch.full_like(self.second_ids, -1), [None] * len(self)
-        for each in found:
+        for each in merged:
             ids[each.region], parts[each.region] = each.other, each.part  # type: ignore[call-overload]
         return replace(self, second_ids=ids, second_parts=tuple(parts))
 

@@ -84,8 +84,8 @@ def lower(plant: Plant, chance: float = 0.9) -> Plant:
     ("rounds", "growth", "tried", "kept"),
     [
         (1, (1.2, 1.2), 1, 1),
-        (3, (1.2, 1.2, 1.05), 3, 2),  # the third grows by too little
-        (3, (1.05, 1.5), 1, 0),
+        (3, (1.2, 1.2, 1.02), 3, 2),  # the third grows by too little
+        (3, (1.02, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
         ("off", (1.2,), 0, 0),
         ("auto", (1.2, 1.2, 1.2, 1.2), 3, 3),

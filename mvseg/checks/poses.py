@@ -153,11 +153,11 @@ def is_sure(pairs: PoseAgreement) -> bool:
     return bool(enough and len(pairs.fitting) >= AGREEMENT.few_views)
 
 
-def _against(pairs: PoseAgreement, kept: list[int]) -> tuple[Floats, Floats]:
+def _against(pairs: PoseAgreement, agreeing: list[int]) -> tuple[Floats, Floats]:
     """(V,) fitting share and median offset of every view against those that are kept; nan without any."""
     fitting, offset = np.full((2, len(pairs.fitting)), np.nan)
     for view in range(len(fitting)):
-        others = [other for other in kept if other != view and pairs.num_masks[view, other]]
+        others = [other for other in agreeing if other != view and pairs.num_masks[view, other]]
         if others:
             fitting[view] = np.average(pairs.fitting[view, others], weights=pairs.num_masks[view, others])
             offset[view] = np.quantile(pairs.offset[view, others], AGREEMENT.most_agree)

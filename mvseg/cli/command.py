@@ -83,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with stopped_by_sigterm(), running(progress=not options.get("quiet", True)):
                 return VERBS[args.verb][0].run(options)
     except (InputError, argparse.ArgumentError) as error:
-        return complain(error, words, known=_list_names(words) if isinstance(error, argparse.ArgumentError) else ())
+        return complain(error, words, options=_list_names(words) if isinstance(error, argparse.ArgumentError) else ())
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0

@@ -21,30 +21,30 @@ UNKNOWN_OPTION = re.compile(r"[Uu]nrecognized arguments: --([\w.]+)|does not acc
 TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
 
 
-def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence[str] = ()) -> int:
+def complain(error: Exception, arguments: Sequence[str] = (), *, options: Sequence[str] = ()) -> int:
     """Print what is wrong with the input, on one line; returns the exit code.
 
     Args:
         arguments: of the command line; an option among them is named as it stands there.
-        known: verbs or options, one of which was perhaps meant by a name that nothing has.
+        options: verbs or options, one of which was perhaps meant by a name that nothing has.
     """
-    sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), known)
+    sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), options)
     say(f"mvseg: error: {sentence}", to_stderr=True)
     return BAD_INPUT
 
 
-def _suggest(message: str, known: Sequence[str]) -> str:
+def _suggest(message: str, options: Sequence[str]) -> str:
     """A sentence about a verb or an option that there is not, with the one that was perhaps meant."""
     if missing := MISSING.match(message):
         needs = missing[2].replace(f"{missing[1]}.", "")
         return f"{missing[1]} needs {needs}: mvseg {missing[1]} --help says more"
     if unknown := UNKNOWN_VERB.match(message):
-        near = get_close_matches(unknown[1], known, n=1)
-        verbs = ", ".join(name for name in known if not name.startswith("-"))
+        near = get_close_matches(unknown[1], options, n=1)
+        verbs = ", ".join(name for name in options if not name.startswith("-"))
         expected = f"did you mean {near[0]}?" if near else f"expected one of {verbs}"
         return f"there is no verb '{unknown[1]}', {expected}"
     if unknown := UNKNOWN_OPTION.search(message):
-        near = get_close_matches(f"--{unknown[1] or unknown[2]}", known, n=1)
+        near = get_close_matches(f"--{unknown[1] or unknown[2]}", options, n=1)
         return f"{message}: did you mean {near[0]}?" if near else message
     return message
 

@@ -62,16 +62,16 @@ def run(args: Namespace) -> int:
         return 0
     from mvseg.runs.pose_photos import pose_photos  # keeps --help and wrong options quick
 
-    pose_photos(args.photos, args.out, config=config, known=known, up=read_up(args.up))
+    pose_photos(args.photos, args.out, config=config, world=known, up=read_up(args.up))
     return 0
 
 
-def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
+def _run_turntable(args: Namespace, world: Known, config: PoseConfig) -> None:
     from mvseg.runs.pose_turntable import pose_board_photos, pose_turntable_photos
 
     is_board = args.turntable == "board"
     used = ("marker", "distance", "positions") if is_board else ("board", "marker", "distance", "positions", "unit")
-    useless = [name for name in used if getattr(known, name)] + (["up"] if args.up is not None else [])
+    useless = [name for name in used if getattr(world, name)] + (["up"] if args.up is not None else [])
     if config != PoseConfig(calibration=config.calibration if is_board else None):
         useless.append("the options of structure from motion")
     if useless:
@@ -85,10 +85,10 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
             turntable=Path(args.turntable),
             angles=args.angles,
         )
-    elif known.board is None:
+    elif world.board is None:
         raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
     else:
-        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit, calibration=config.calibration)
+        pose_board_photos(args.photos, args.out, board=world.board, unit=world.unit, calibration=config.calibration)
 
 
 def _read_distance(words: list[str] | None) -> tuple[str, str, float] | None:

@@ -54,17 +54,18 @@ def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
     return leaves[~torch.isin(leaves, torch.cat(changed))]
 
 
-def leave_joined(seen: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
-    """The leaves that stay as they were `seen` (D,), without those that other masks join: at least half of the masks of
-    such a leaf are matched to one that the user speaks of, and that is of no such leaf.
+def leave_joined(previous: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
+    """The leaves that stay as they were `previous` (D,), without those that other masks join: at least half of the
+    masks of such a leaf are matched to one that the user speaks of, and that is of no such leaf.
 
     Args:
-        seen: (D,) int64, their ids; -1 for all other masks.
+        previous: (D,) int64, their ids; -1 for all other masks.
         matched_ids: (D,) int64, the ids of the masks matched anew.
         is_held: (D,) bool, the masks that the user speaks of.
     """
-    is_other = is_held & (seen < 1) & (matched_ids > 0)
+    is_other = is_held & (previous < 1) & (matched_ids > 0)
     is_joined = torch.isin(matched_ids, matched_ids[is_other])
-    num = int(seen.max().clamp(min=0)) + 1 if len(seen) else 1
-    joined, all_of = (torch.bincount(seen[each & (seen > 0)], minlength=num) for each in (is_joined, seen > 0))
-    return seen.where((2 * joined < all_of)[seen.clamp(min=0)] & (seen > 0), -1)
+    num = int(previous.max().clamp(min=0)) + 1 if len(previous) else 1
+    is_known = previous > 0
+    joined, all_of = (torch.bincount(previous[each & is_known], minlength=num) for each in (is_joined, is_known))
+    return previous.where((2 * joined < all_of)[previous.clamp(min=0)] & (previous > 0), -1)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Literal
 
 import cv2
@@ -19,7 +20,7 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 from mvseg.verification.evidence import Evidence, Ints, paint_view, see_instances
 from mvseg.verification.numbers import CHOICE, EVIDENCE
 
@@ -76,7 +77,7 @@ def list_doubts(
     surfaces: Mapping[int, LeafSurface] | None,
     *,
     cameras: Cameras,
-    left: Sequence[LeftOut] = (),
+    rejected: Sequence[RejectedCandidate] = (),
     photos: ReadPhoto | None = None,
 ) -> list[Doubt]:
     """List places that the user should look at, at most `DOUBTS.most`: first places without masks and half masks, then
@@ -91,13 +92,13 @@ def list_doubts(
     found = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
     evidence = see_instances(masks.regions, known, cameras)
-    free: list[list[int]] = [[] for _ in left]  # rows of each candidate's masks where none of the result lies
-    for view, size in enumerate(cameras.sizes.tolist() if known or left else ()):
+    free: list[list[int]] = [[] for _ in rejected]  # rows of each candidate's masks where none of the result lies
+    for view, size in enumerate(cameras.sizes.tolist() if known or rejected else ()):
         taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
         if known:
             painted = paint_view(known, cameras, view)
             found += _doubt_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
-        for rows, candidate in zip(free, left, strict=True):
+        for rows, candidate in zip(free, rejected, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
     usual, areas = _usual_area(masks), masks.regions.areas.tolist()
@@ -106,8 +107,9 @@ def list_doubts(
     found = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in found]
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
-    queue = _doubt_left(left, free, usual=usual)
-    for each in sorted(found, key=lambda one: (*_order(one), one.view, one.instance, one.region)):
+    queue = _doubt_left(rejected, free, usual=usual)
+    place = attrgetter("view", "instance", "region")
+    for each in sorted(found, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
         if each.doubt >= DOUBTS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
@@ -142,7 +144,7 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
         if ids[row] > 0:
             found.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
-            doubt = DOUBTS.lone * min(1.0, float(areas[row]) / usual)
+            doubt = min(1.0, float(areas[row]) / usual)
             found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
     return found
 
@@ -171,12 +173,12 @@ def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) ->
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
         found.append(
-            Doubt("half", DOUBTS.unmasked, largest.view, instance, region=largest.row, found=len(views),
+            Doubt("half", 1.0, largest.view, instance, region=largest.row, found=len(views),
                   expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
         )  # fmt: skip
     if len({part.view for part in places}) > 1:  # two outlines are a leaf
         outlines = tuple((part.view, part.outline) for part in places[: DOUBTS.most_places])
-        found.append(Doubt("place", DOUBTS.unmasked, outlines[0][0], -1, outlines=outlines))
+        found.append(Doubt("place", 1.0, outlines[0][0], -1, outlines=outlines))
     return found
 
 
@@ -190,11 +192,11 @@ def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
     return free
 
 
-def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual: float) -> list[Doubt]:
+def _doubt_left(rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[int]], *, usual: float) -> list[Doubt]:
     """Candidates that were not chosen, in the views where no mask of the result lies, the largest mask first; `usual`
     as `_usual_area` says."""
     found = []
-    for each, rows in zip(left, free, strict=True):
+    for each, rows in zip(rejected, free, strict=True):
         if each.chance < DOUBTS.least_chance or len(rows) < CHOICE.least_views:
             continue
         regions = each.masks.regions
@@ -232,12 +234,12 @@ def _doubt_view(
         empty = float((mask & ~taken[box]).sum() / mask.sum())
         nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
         if nearest >= 0 and evidence.visible[nearest, instance] >= DOUBTS.similar:
-            doubt = DOUBTS.covered * min(1.0, float(evidence.visible[nearest, instance]) / DOUBTS.surely)
+            doubt = min(1.0, float(evidence.visible[nearest, instance]) / DOUBTS.surely)
             found.append(Doubt("covered", doubt, view, instance, region=nearest))
         elif empty >= DOUBTS.empty:
             outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
             size = min(1.0, float(mask.sum()) / _usual_area(masks))
-            found.append(Doubt("missing", DOUBTS.missing * empty * share, view, instance, outlines=outlines, size=size))
+            found.append(Doubt("missing", empty * share, view, instance, outlines=outlines, size=size))
     return found
 
 

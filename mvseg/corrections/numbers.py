@@ -40,10 +40,6 @@ class QuestionNumbers:
     most: int = 200  # limit: questions of a page, at most: it asks a few itself, and the others where the user clicks
     digits: int = 6  # limit: decimals of the change by an answer; later ones make a tie
     as_good: float = 0.1  # chosen: match score below the best from which masks are as good; the largest is shown
-    lone: float = 0.6  # chosen: doubt of a mask that was matched to nothing, at most
-    missing: float = 0.8  # chosen: doubt where a mask is missing, at most
-    covered: float = 0.9  # chosen: doubt where a mask of another leaf is in the place of one, at most
-    unmasked: float = 0.8  # chosen: doubt of such a place
     open: float = 0.5  # chosen: unhidden share of a surface that should have a mask; see `EVIDENCE.open_pixels`
     empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one

@@ -8,18 +8,18 @@ from dataclasses import replace
 from mvseg.corrections.corrected import APPLIED, Fate, RejectedPixel
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 from mvseg.verification.evidence import paint_view
 
 
 def settle_edits(
     edits: Sequence[Fate],
     refused: Sequence[RejectedPixel],
-    left: Sequence[LeftOut],
+    rejected: Sequence[RejectedCandidate],
     surfaces: Mapping[int, LeafSurface],
     *,
     cameras: Cameras,
-) -> tuple[tuple[LeftOut, ...], tuple[Fate, ...]]:
+) -> tuple[tuple[RejectedCandidate, ...], tuple[Fate, ...]]:
     """The edits that say "no leaf" where no mask is, once all is known that the user may be asked about.
 
     They are applied where they answer a question: a candidate that was not chosen is shown there, which goes if the
@@ -30,11 +30,11 @@ def settle_edits(
     """
     gone, answers = set[int](), set[int]()
     for each in refused:
-        shown = {n for n, other in enumerate(left) if other.masks.regions.at(each.view, each.column, each.row)}
+        shown = {n for n, other in enumerate(rejected) if other.masks.regions.at(each.view, each.column, each.row)}
         gone |= shown if each.everywhere else set()
         width, height = cameras.sizes[each.view].tolist()
         is_in_photo = 0 <= each.column < width and 0 <= each.row < height
         if shown or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
             answers.add(each.edit)
     fates = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in edits)
-    return tuple(other for n, other in enumerate(left) if n not in gone), fates
+    return tuple(other for n, other in enumerate(rejected) if n not in gone), fates

@@ -131,7 +131,7 @@ def read_coco(
         warn(Finding("annotations_without_mask", str(path), {"count": num_boxes}))
     with faults_of(path):
         check_corners(annotation.segmentation for view in chosen for _, annotation in view)
-    check_categories(counts, categories, known=names.values(), source=path)
+    check_categories(counts, categories, categories=names.values(), source=path)
     sizes = scene.cameras.sizes.tolist()
     return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
 

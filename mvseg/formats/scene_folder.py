@@ -127,13 +127,13 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
     return read_masks(scene, recognise_masks(scene, Path(masks)), crowd=crowd, categories=categories)
 
 
-def read_masks(scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
+def read_masks(scene: Scene, files: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
     """The second half of `load_masks`: read the files that were recognised."""
-    if categories and found.kind not in ("COCO", "labelme", "YOLO", YOLO_TRACKS):
-        raise InputError(f"{found.source}: holds {found.kind}, which have no categories to select from")
-    if found.kind == "COCO":
-        parts = found.files[0]
-        path = parts[0] if len(parts) == 1 else found.source
+    if categories and files.kind not in ("COCO", "labelme", "YOLO", YOLO_TRACKS):
+        raise InputError(f"{files.source}: holds {files.kind}, which have no categories to select from")
+    if files.kind == "COCO":
+        parts = files.files[0]
+        path = parts[0] if len(parts) == 1 else files.source
         views = read_coco(path, scene, parts=parts, crowd=crowd, categories=categories)
         return stack_views(views, scene, source=path)
-    return stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)
+    return stack_views(read_views(scene, files, wanted=categories), scene, source=files.source)

@@ -44,7 +44,7 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     if len(shown) and not len(masks):
         warn(Finding("no_leaf_left"))
     edited = replace(
-        matched, instances=Instances(), left=(), edits=corrected.fates, refused=corrected.refused
+        matched, instances=Instances(), rejected=(), edits=corrected.fates, refused=corrected.refused
     ).with_masks(masks)
     if opened.is_chosen or config.reconstruct is not None:
         with timed("follow"):
@@ -65,7 +65,7 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
             cameras=cameras,
             more=plant.matched,
             gone=_taken_away(shown, masks),
-            seen=seen_ids(masks, replace(corrected.masks, instance_ids=seen)),
+            previous=seen_ids(masks, replace(corrected.masks, instance_ids=seen)),
             drawn=plant.drawn,
             min_probability=config.detect.min_probability,
             cache=opened.surfaces,
@@ -73,23 +73,23 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     return edited.with_leaves(leaves)
 
 
-def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant, Tensor]:
+def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[Plant, Tensor]:
     """Match the edited masks anew, but for those of leaves that stay: these keep their ids.
 
     Where the views choose, and the user speaks of such leaves only, nothing is matched, and what matching said stays.
 
     Args:
         corrected: D masks and their links.
-        seen: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
+        previous: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
 
     Returns:
-        What is known with the D masks, and `seen` without the leaves that other masks join, see `leave_joined`.
+        What is known with the D masks, and `previous` without the leaves that other masks join, see `leave_joined`.
     """
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
-    if plant.opened.is_chosen and not rejects and not bool((is_held & (seen < 1)).any()):
-        ids_only = replace(masks, instance_ids=seen).close_gaps()
-        return replace(plant, matching=plant.matching.with_masks(ids_only)), seen
+    if plant.opened.is_chosen and not rejects and not bool((is_held & (previous < 1)).any()):
+        ids_only = replace(masks, instance_ids=previous).close_gaps()
+        return replace(plant, matching=plant.matching.with_masks(ids_only)), previous
     is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else the user's masks tell it better
     matching = match_masks(
         masks,
@@ -99,11 +99,11 @@ def _match_anew(plant: Plant, corrected: Corrected, seen: Tensor) -> tuple[Plant
         residual_px=plant.matching.report.residual_px if is_known else None,
     )
     matched = matching.masks.to("cpu")
-    seen = leave_joined(seen, matched.instance_ids, is_held)
-    ids = torch.where(seen > 0, seen + matched.num_instances, matched.instance_ids)
+    previous = leave_joined(previous, matched.instance_ids, is_held)
+    ids = torch.where(previous > 0, previous + matched.num_instances, matched.instance_ids)
     disagreement = plant.opened.find_disagreement(matching)
     matching = matching.with_masks(replace(matched, instance_ids=ids).close_gaps())
-    return replace(plant, matching=matching, disagreement=disagreement), seen
+    return replace(plant, matching=matching, disagreement=disagreement), previous
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:

@@ -23,17 +23,19 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache
 from mvseg.regions import Regions
 from mvseg.results.result import Instances
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 
 MOST_BYTES = 1 << 29  # limit: of the file, inflated: a stranger's file must not fill the memory
-FIELDS = ("matching", "instances", "proposals", "matched", "image_size", "boxes", "left", "agreement", "disagreement")
+FIELDS = (
+    "matching", "instances", "proposals", "matched", "image_size", "boxes", "rejected", "agreement", "disagreement",
+)  # fmt: skip
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [
     Approach,
     Finding,
     Instances,
     LeafSurface,
-    LeftOut,
+    RejectedCandidate,
     MatchReport,
     Masks,
     Matching,
@@ -42,8 +44,8 @@ CLASSES: list[Any] = [
 ]
 
 
-def pack_plant(plant: Plant, said: Sequence[Finding]) -> bytes | None:
-    """Pack a plant before edits, its surfaces, and the warnings on the way (`said`). None where it is
+def pack_plant(plant: Plant, findings: Sequence[Finding]) -> bytes | None:
+    """Pack a plant before edits, its surfaces, and the warnings on the way (`findings`). None where it is
     too much to be read again."""
     packed = io.BytesIO()
     opened = plant.opened
@@ -54,7 +56,7 @@ def pack_plant(plant: Plant, said: Sequence[Finding]) -> bytes | None:
             "approaches": opened.surfaces.approaches,
             "surfaces": opened.surfaces.surfaces,
             "snapped": {name: torch.from_numpy(each) for name, each in opened.snapped.items()},
-            "said": list(said),
+            "said": list(findings),
         },
         packed,
     )

@@ -129,7 +129,7 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
         matched=result.matched,
         image_size=detected.longest,
         boxes=whole_photos(opened.scene) if detected.boxes is None else detected.boxes,
-        left=(),
+        rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
     return plant.with_leaves(result.leaves) if opened.is_chosen else plant

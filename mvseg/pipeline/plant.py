@@ -27,7 +27,7 @@ from mvseg.verification.leaf_color import colors_of_leaves
 from mvseg.verification.leaf_scores import rate_pass
 
 if TYPE_CHECKING:
-    from mvseg.verification.choose import Leaves, LeftOut
+    from mvseg.verification.choose import Leaves, RejectedCandidate
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Plant:
         matched: tables of matched proposals, the sure ones first.
         image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
-        left: candidates that the views did not choose.
+        rejected: candidates that the views did not choose.
         agreement: of the views about the leaves, see `Leaves`; NaN where they do not choose.
         edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
@@ -59,7 +59,7 @@ class Plant:
     matched: tuple[Masks, ...]
     image_size: int
     boxes: Tensor
-    left: tuple[LeftOut, ...]
+    rejected: tuple[RejectedCandidate, ...]
     agreement: float = float("nan")
     edits: tuple[Fate, ...] = ()
     refused: tuple[RejectedPixel, ...] = ()
@@ -118,7 +118,7 @@ class Plant:
     def with_leaves(self, leaves: Leaves) -> Plant:
         """The same with the leaves that the views chose."""
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
-        chosen = replace(self, instances=instances, left=leaves.left, agreement=leaves.agreement)
+        chosen = replace(self, instances=instances, rejected=leaves.rejected, agreement=leaves.agreement)
         return chosen.with_masks(leaves.masks)
 
     def cut_merged(self) -> Plant:
@@ -141,7 +141,7 @@ def match_given(opened: Opened) -> Plant:
         matched=(matching.masks,),
         image_size=int(boxes.max()),
         boxes=boxes,
-        left=(),
+        rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
     return plant if opened.is_checked else plant.cut_merged()  # surfaces tell better which masks show two

@@ -119,7 +119,7 @@ def _middling_lenses(photos: Mapping[str, Sequence[Grey]], focal: float) -> dict
 
 
 def _fit(
-    seen: Mapping[str, Seen],
+    sightings: Mapping[str, Seen],
     board: BoardConfig,
     lenses: Mapping[str, TableCamera],
     *,
@@ -128,20 +128,21 @@ def _fit(
     tolerance: float,
 ) -> tuple[list[int], TableFit]:
     """The table as these cameras see it, from lenses that are nearly right: places of the angles at which the board is
-    seen, and what explains it best; its cameras are in the order of `seen`."""
+    seen, and what explains it best; its cameras are in the order of `sightings`."""
     poses = {name: {angle: _board_pose(*each, board, lenses[name]) for angle, each in found.items()}
-             for name, found in seen.items()}  # fmt: skip
-    corners = np.concatenate([board.corners()[numbers] for found in seen.values() for numbers, _ in found.values()])
+             for name, found in sightings.items()}  # fmt: skip
+    numbers = [each for photos in sightings.values() for each, _ in photos.values()]
+    corners = np.concatenate([board.corners()[each] for each in numbers])
     cameras, angles, world_from_board = _initialise(lenses, poses, middle=corners.mean(0))
     used = sorted(angles)
     rows = [
         (np.full(len(px), index), np.full(len(px), used.index(angle)), board.corners()[numbers], px)
-        for index, found in enumerate(seen.values())
+        for index, found in enumerate(sightings.values())
         for angle, (numbers, px) in found.items()
     ]
     camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
     fit = fit_table(
-        [cameras[name] for name in seen],
+        [cameras[name] for name in sightings],
         np.array([angles[each] for each in used]),
         world_from_board,
         sightings=Sightings(camera=camera, angle=angle, point=point, px=px),

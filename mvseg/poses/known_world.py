@@ -61,7 +61,7 @@ class Placement:
         return f"scale from {self.source}{fit}{wrong}"
 
 
-def place(scene: Scene, known: Known) -> Placement:
+def place(scene: Scene, world: Known) -> Placement:
     """The similarity that transforms a scene into the known world.
 
     Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
@@ -71,15 +71,15 @@ def place(scene: Scene, known: Known) -> Placement:
     Raises:
         InputError: the markers or photos named are not seen, the positions do not fit the photos or are mirrored.
     """
-    if known.board is not None:
-        return _by_board(scene, known.board, known.unit)
-    if known.marker is not None:
-        return _by_markers(scene, known.marker, known.unit)
-    if known.distance is not None:
-        return _by_distance(scene, known.distance, known.unit)
-    if known.positions is not None:
-        return _by_positions(scene, known.positions, known.unit)
-    return Placement(similarity=scale_by(1.0), unit=known.unit)
+    if world.board is not None:
+        return _by_board(scene, world.board, world.unit)
+    if world.marker is not None:
+        return _by_markers(scene, world.marker, world.unit)
+    if world.distance is not None:
+        return _by_distance(scene, world.distance, world.unit)
+    if world.positions is not None:
+        return _by_positions(scene, world.positions, world.unit)
+    return Placement(similarity=scale_by(1.0), unit=world.unit)
 
 
 def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:

@@ -200,12 +200,12 @@ def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile])
     return tuple(photo.name for name, photo in photo_of.items() if counts[name] < STRUCTURE.few_features)
 
 
-def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
+def _too_few(count: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
     """The sentence for too few registered photos."""
     poor = f"; {len(plain)} have hardly any texture, the first is {plain[0]}" if plain else ""
     asked = "--min_registered asks for" if given else "expected at least"
-    less = "" if given or found < STRUCTURE.least else f", or --min_registered {found} to accept these"
-    text = f"{found} of {num_photos} photos could be registered, {asked} {least}{poor}"
+    less = "" if given or count < STRUCTURE.least else f", or --min_registered {count} to accept these"
+    text = f"{count} of {num_photos} photos could be registered, {asked} {least}{poor}"
     return f"{text}. Next: {NEXT_STEPS}{less}"
 
 

@@ -61,10 +61,10 @@ def _steps(num_photos: int) -> list[int]:
     return [sign * step for step in steps for sign in (1, -1)]
 
 
-def _most_alike(alike: NDArray[np.int64], known: set[Pair]) -> set[Pair]:
+def _most_alike(alike: NDArray[np.int64], chosen: set[Pair]) -> set[Pair]:
     """The photos that are most alike for each photo, not counting known pairs."""
     left = alike.copy()
-    for i, j in known:
+    for i, j in chosen:
         left[i, j] = left[j, i] = 0
     found = set()
     for i, row in enumerate(left):

@@ -63,17 +63,17 @@ def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
     return kept
 
 
-def _exchange(crowding: NDArray[np.float64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _exchange(crowding: NDArray[np.float64], is_taken: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """The same number of views, better spread: the exchange of two views that helps most, until none helps."""
-    kept = kept.copy()
+    is_taken = is_taken.copy()
     while True:
-        load = crowding @ kept
-        inside, outside = np.flatnonzero(kept), np.flatnonzero(~kept)
+        load = crowding @ is_taken
+        inside, outside = np.flatnonzero(is_taken), np.flatnonzero(~is_taken)
         change = load[outside] - load[inside, None] - crowding[np.ix_(inside, outside)]
         if change.min() >= -RAYS.tie * load[inside].sum():
-            return kept
+            return is_taken
         goes, comes = np.unravel_index(_first_least(change.ravel()), change.shape)
-        kept[inside[goes]], kept[outside[comes]] = False, True
+        is_taken[inside[goes]], is_taken[outside[comes]] = False, True
 
 
 def _first_least(values: NDArray[np.float64]) -> int:

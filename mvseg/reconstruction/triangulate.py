@@ -16,11 +16,11 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 
-def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
+def triangulate_points(cameras: Cameras, sightings: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
     """Points that two views or more agree on.
 
     Args:
-        seen: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
+        sightings: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
 
     Returns:
         {point: (3,) world coordinates}; points seen in a single view, or not within `RAYS.most_error` in each, are left
@@ -29,7 +29,7 @@ def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, 
     centers, sizes = cameras.centers.cpu().numpy(), cameras.sizes.cpu().numpy()
     px_from_world = cameras.px_from_world.cpu().numpy()
     points: dict[Key, Floats] = {}
-    for key, places in seen.items():
+    for key, places in sightings.items():
         views = [view for view, _ in places]
         if len(set(views)) < 2 or len(set(views)) < len(views):
             continue

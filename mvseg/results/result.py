@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.results.run_record import RunRecord
     from mvseg.traits.measure import Traits
-    from mvseg.verification.choose import LeftOut
+    from mvseg.verification.choose import RejectedCandidate
 
 T = TypeVar("T")
 
@@ -60,8 +60,8 @@ class Instances:
     def renumber(self, numbers: Mapping[int, int]) -> Instances:
         """Instance k by the id `numbers[k]`."""
 
-        def by_number(known: Mapping[int, T]) -> dict[int, T]:
-            return {numbers[instance]: each for instance, each in known.items()}
+        def by_number(values: Mapping[int, T]) -> dict[int, T]:
+            return {numbers[instance]: each for instance, each in values.items()}
 
         return Instances(
             probabilities=by_number(self.probabilities),
@@ -100,7 +100,7 @@ class Result:
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
-        left: candidates that the views did not choose, the most likely leaf first.
+        rejected: candidates that the views did not choose, the most likely leaf first.
         findings: what the run noticed of its input and of the result, the gravest first.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
@@ -119,7 +119,7 @@ class Result:
     matching: Matching
     instances: Instances = Instances()
     photos: Photos | None = None
-    left: tuple[LeftOut, ...] = ()
+    rejected: tuple[RejectedCandidate, ...] = ()
     findings: tuple[Finding, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""

@@ -37,7 +37,7 @@ def pose_photos(
     out: Path,
     *,
     config: PoseConfig = PoseConfig(),
-    known: Known = Known(),
+    world: Known = Known(),
     up: Up | None = None,
 ) -> Scene:
     """Estimate the cameras of photos, and write a scene folder that `load_scene` reads: whole, or not at all.
@@ -48,7 +48,7 @@ def pose_photos(
         photos: folder of photos, with one folder per camera below it or none; or a video, of which sharp frames become
             the photos.
         out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
-        known: where scale and axes come from.
+        world: where scale and axes come from.
         up: the direction of up in the known world, or how to find it.
 
     Raises:
@@ -56,15 +56,15 @@ def pose_photos(
             known does not fit them or names a unit of no length, or `out` holds something other than an earlier scene
             of these photos.
     """
-    if known.unit and not known.scales:  # the lengths of the world would get it, and are arbitrary
-        raise InputError(f"unit is {known.unit}, and no length is known: expected --marker, --distance, ... with it")
+    if world.unit and not world.scales:  # the lengths of the world would get it, and are arbitrary
+        raise InputError(f"unit is {world.unit}, and no length is known: expected --marker, --distance, ... with it")
     is_clip, file = is_video(photos), config.calibration
-    output = Output("scene", of=(photos,), reads=tuple(path for path in (file, known.positions) if path is not None))
+    output = Output("scene", of=(photos,), reads=tuple(path for path in (file, world.positions) if path is not None))
     check_place(out, output)
     source, names = (photos, []) if is_clip else check_folders(photos, out, output)
     calibration = None if file is None else read_calibration(file.parent, file.name)
-    if known.positions is not None:
-        read_positions(known.positions)  # to find mistakes in it before the minutes that follow
+    if world.positions is not None:
+        read_positions(world.positions)  # to find mistakes in it before the minutes that follow
     start, run = time.perf_counter(), dict[str, Any](made_by())
     with replace_result(out, run, output) as folder:
         with collect_warnings() as findings:
@@ -77,12 +77,12 @@ def pose_photos(
                 warn(zoom_finding(zooms, lengths[0].px))
             for finding in least_sure(lengths).doubts("focal_length_unsure"):
                 warn(finding)
-            placement = place(write_structure(structure, folder), known)
+            placement = place(write_structure(structure, folder), world)
             scene = move_structure(structure, placement.similarity, folder)
             scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
             write_cameras(scene, folder)
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
-        run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
+        run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(world), "up": up}}
         run |= {
             "up": scene.up,
             "findings": [each.as_json() for each in findings],

@@ -93,44 +93,45 @@ def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> s
     return shlex.join(["mvseg", verb, "--again", str(folder), "--corrections", str(corrections)])
 
 
-def _list_changes(folder: Path, said: RunRecord) -> list[Finding]:
+def _list_changes(folder: Path, record: RunRecord) -> list[Finding]:
     changes = []
-    if said.code != code_hash():
-        changes.append(Finding("other_version", values={"before": said.mvseg[:60], "now": __version__}))
-    named = [find_place(folder, said, Path(str(said.config[name]))).resolve() for name in READ if said.config.get(name)]
-    if isinstance(detect := said.config.get("detect"), dict):
+    if record.code != code_hash():
+        changes.append(Finding("other_version", values={"before": record.mvseg[:60], "now": __version__}))
+    config = record.config
+    named = [find_place(folder, record, Path(str(config[name]))).resolve() for name in READ if config.get(name)]
+    if isinstance(detect := record.config.get("detect"), dict):
         from mvseg.detectors.zoo import weights_path  # loads torchvision
 
         with suppress(InputError):  # they are gone, which is said where they are wanted
             named.append(weights_path(str(detect.get("weights"))).resolve())
-    for stated, sha256 in said.inputs.items():
-        path = find_place(folder, said, Path(stated))
+    for stated, sha256 in record.inputs.items():
+        path = find_place(folder, record, Path(stated))
         if not (path.is_dir() or path.is_file()):
             changes.append(Finding("input_gone", str(path)))
         elif not any(path.resolve().is_relative_to(place) for place in named):
             changes.append(Finding("input_not_read", str(path)))
         elif hash_files(path) != sha256:
             changes.append(Finding("input_changed", str(path)))
-    changes += _list_other_photos(folder, said)
-    before = {name: _option(said, name) for name in GONE}
+    changes += _list_other_photos(folder, record)
+    before = {name: _option(record, name) for name in GONE}
     gone = [code for name, (usual, code) in GONE.items() if before[name] not in (None, usual)]
     return changes + [Finding(code, str(folder)) for code in gone]
 
 
-def _option(said: RunRecord, name: str) -> Any:
+def _option(record: RunRecord, name: str) -> Any:
     """An option of the run; None where it had none of the name."""
     stage, _, own = name.rpartition(".")
-    inside = said.config.get(stage) if stage else said.config
+    inside = record.config.get(stage) if stage else record.config
     return inside.get(own) if isinstance(inside, dict) else None
 
 
-def _list_other_photos(folder: Path, said: RunRecord) -> list[Finding]:
-    if said.photos is None:
+def _list_other_photos(folder: Path, record: RunRecord) -> list[Finding]:
+    if record.photos is None:
         return []
-    place, count = find_place(folder, said, said.photos), len(said.photo_sha256)
-    gone = [name for name in said.photo_sha256 if not _is_file_below(place, name)]
+    place, count = find_place(folder, record, record.photos), len(record.photo_sha256)
+    gone = [name for name in record.photo_sha256 if not _is_file_below(place, name)]
     others = [
-        name for name, sha256 in said.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
+        name for name, sha256 in record.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
     ]
     return [
         Finding(code, str(place), {"count": len(names), "total": count, "names": tuple(names)})
@@ -143,13 +144,13 @@ def _is_file_below(place: Path, name: str) -> bool:
     return (place / name).is_file() and (place / name).absolute().is_relative_to(place.absolute()) and ".." not in name
 
 
-def _read_config(folder: Path, said: RunRecord) -> RunConfig:
+def _read_config(folder: Path, record: RunRecord) -> RunConfig:
     """The options of the stages."""
     options = {
         stage: {name: each for name, each in value.items() if f"{stage}.{name}" not in GONE}
         if isinstance(value, dict)
         else value
-        for stage, value in said.config.items()
+        for stage, value in record.config.items()
         if stage not in (*PLACES, *GONE, "from_here")
     }
     known = asdict(RunConfig())
@@ -163,5 +164,5 @@ def _read_config(folder: Path, said: RunRecord) -> RunConfig:
         return TypeAdapter(RunConfig).validate_python({"reconstruct": None, **options})
     except (ValidationError, InputError) as error:
         problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        message = f"mvseg {said.mvseg[:60]} made this result, with options that this version does not have ({problem})"
+        message = f"mvseg {record.mvseg[:60]} made it with options that this version does not have ({problem})"
         raise InputError(f"{folder}: {message}; expected one made by this version") from None

@@ -388,9 +388,9 @@ class Corrector(Generic[Kind]):
             self._tell_making(None)
         return {}
 
-    def _tell_making(self, said: str | None) -> None:
+    def _tell_making(self, step: str | None) -> None:
         with self.news:
-            self.making = said
+            self.making = step
             self._notify()
 
     def close(self) -> None:

@@ -307,14 +307,14 @@ def _read_detector(folder: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def keep_numbers(result: Result, known: dict[str, int], shown: Masks | None = None) -> Result:
+def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | None = None) -> Result:
     """Give leaves the numbers that most of their masks' pixels had last, and the others new ones, in their order. So
     ids may have gaps.
 
     Args:
         result: with ids of its own.
-        known: {name of a mask: number of its leaf}; learns those of the result.
-        shown: masks that the page shows, with their numbers: a mask without a known name, as a detector that has
+        number_of: {name of a mask: number of its leaf}; learns those of the result.
+        previous: masks that the page shows, with their numbers: a mask without a known name, as a detector that has
             learned finds it, votes for the leaf of the mask that it covers (`EVIDENCE.fits`). None: there are none.
     """
     masks = result.masks
@@ -322,22 +322,22 @@ def keep_numbers(result: Result, known: dict[str, int], shown: Masks | None = No
     named = [(ids[row], areas[row], name, row) for row, name in enumerate(names) if ids[row] > 0]
     votes = Counter[tuple[int, int]]()
     for instance, area, name, row in named:
-        if name in known:
-            votes[instance, known[name]] += area
-        elif shown is not None:
+        if name in number_of:
+            votes[instance, number_of[name]] += area
+        elif previous is not None:
             mask = masks.regions.placed(row)
-            beside = (shown.view_index == masks.view_index[row]) & (shown.instance_ids > 0)
+            beside = (previous.view_index == masks.view_index[row]) & (previous.instance_ids > 0)
             for other in beside.nonzero()[:, 0].tolist():
-                if shown.regions.placed(other).iou(mask) > EVIDENCE.fits:
-                    votes[instance, int(shown.instance_ids[other])] += area
+                if previous.regions.placed(other).iou(mask) > EVIDENCE.fits:
+                    votes[instance, int(previous.instance_ids[other])] += area
     numbers: dict[int, int] = {}
     for instance, number in sorted(votes, key=lambda pair: (-votes[pair], pair)):
         if instance not in numbers and number not in numbers.values():
             numbers[instance] = number
-    new = count(max(known.values(), default=0) + 1)
+    new = count(max(number_of.values(), default=0) + 1)
     for instance in sorted({each[0] for each in named} - set(numbers)):
         numbers[instance] = next(new)
-    known.update({name: numbers[instance] for instance, _, name, _ in named})
+    number_of.update({name: numbers[instance] for instance, _, name, _ in named})
 
     def renumber(ids: Tensor) -> Tensor:
         return torch.tensor([numbers.get(each, -1) for each in ids.tolist()], dtype=torch.int64, device=ids.device)

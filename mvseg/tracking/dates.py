@@ -138,9 +138,9 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
         raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
     frame, leaves = None if traits.up is None else level_frame(traits.up), []
 
-    def numbers_of(found: Mapping[str, Measurement]) -> dict[str, Number]:
-        units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in found}
-        return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
+    def numbers_of(measured: Mapping[str, Measurement]) -> dict[str, Number]:
+        units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in measured}
+        return {name: Number(m.value, m.sd, units[name]) for name, m in measured.items() if m.exists}
 
     nodes = {node.leaf: (stem.number, node) for stem in traits.stems for node in stem.nodes}
     for leaf in traits.leaves:

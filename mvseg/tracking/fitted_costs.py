@@ -126,42 +126,42 @@ class Differences:
 def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = None) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
     likelier than not. What the user says of them counts, too. `widths`: see `Differences`."""
-    return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.said
+    return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.links
 
 
-def costs_of(found: Differences, scales: Scales) -> Floats:
+def costs_of(apart: Differences, scales: Scales) -> Floats:
     """(N, M) costs, see `fitted_costs`."""
-    as_it_runs, turned = _place_costs(found, scales)
-    costs = np.minimum(as_it_runs, turned + COSTS.flipped) + size_costs(found, scales) + found.crowd - scales.parting
-    if found.near is not None:
-        costs += scales.cloud * 0.5 * student_tail(found.near / (scales.near * found.width), 2)
+    as_it_runs, turned = _place_costs(apart, scales)
+    costs = np.minimum(as_it_runs, turned + COSTS.flipped) + size_costs(apart, scales) + apart.crowd - scales.parting
+    if apart.near is not None:
+        costs += scales.cloud * 0.5 * student_tail(apart.near / (scales.near * apart.width), 2)
     return np.asarray(costs)
 
 
-def _place_costs(found: Differences, scales: Scales) -> Floats:
+def _place_costs(apart: Differences, scales: Scales) -> Floats:
     """(2, N, M) of bases and directions. A base moves up the more the higher it is, as internodes below it stretch;
     where up is not known, as far in any direction."""
-    across = student_tail(found.across / np.hypot(scales.across * found.width, found.base_sd), 2)
-    up = (scales.along + scales.stretch * found.height) * found.width
-    along = student_tail(found.along / np.hypot(up, found.base_sd), 1)
-    away = student_tail(found.away / np.hypot(scales.across * found.width, found.base_sd), 3)
-    turn = student_tail(found.turn / np.hypot(scales.turn, found.turn_sd), 2)
-    return np.asarray(0.5 * (np.where(found.knows_up, across + along, away) + turn))
+    across = student_tail(apart.across / np.hypot(scales.across * apart.width, apart.base_sd), 2)
+    up = (scales.along + scales.stretch * apart.height) * apart.width
+    along = student_tail(apart.along / np.hypot(up, apart.base_sd), 1)
+    away = student_tail(apart.away / np.hypot(scales.across * apart.width, apart.base_sd), 3)
+    turn = student_tail(apart.turn / np.hypot(scales.turn, apart.turn_sd), 2)
+    return np.asarray(0.5 * (np.where(apart.knows_up, across + along, away) + turn))
 
 
-def size_costs(found: Differences, scales: Scales) -> Floats:
+def size_costs(apart: Differences, scales: Scales) -> Floats:
     """(N, M) of sizes alone, which hardly change once a leaf has stopped growing.
 
     A size is the root of an area, or a length where one of the two leaves has no area. A leaf that grows has room to
     until it is as long as the longest one of the later date, and grows the faster the more it has, up to a factor of e.
     Nobody knows which leaves do: either may be so.
     """
-    larger = np.where(np.isfinite(found.wider), found.wider, found.longer)
-    growth = np.minimum(scales.growth * found.days * np.minimum(found.room, 1.0), found.room)
-    loose = np.where(found.is_loose, scales.loose, 0.0)
+    larger = np.where(np.isfinite(apart.wider), apart.wider, apart.longer)
+    growth = np.minimum(scales.growth * apart.days * np.minimum(apart.room, 1.0), apart.room)
+    loose = np.where(apart.is_loose, scales.loose, 0.0)
     young = np.sqrt(scales.size**2 + loose**2 + (scales.spurt * growth) ** 2)
     stays = np.log(scales.grown) - 0.5 * student_tail(larger / np.hypot(scales.size, loose), 1)
-    grows = -0.5 * student_tail((found.longer - growth) / young, 1)
+    grows = -0.5 * student_tail((apart.longer - growth) / young, 1)
     return np.asarray(-np.logaddexp(stays, grows))
 
 

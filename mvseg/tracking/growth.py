@@ -145,9 +145,9 @@ def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
     return float(line[0]), math.sqrt(covariance[0, 0]) if is_known else math.nan
 
 
-def fit_curve(track: int, trait: str, seen: tuple[Floats, Floats, Floats]) -> GrowthCurve:
+def fit_curve(track: int, trait: str, sizes: tuple[Floats, Floats, Floats]) -> GrowthCurve:
     """The model with the least Akaike criterion through (times, values, sds); robust against single dates."""
-    times, values, sds = seen
+    times, values, sds = sizes
     sds = np.maximum(np.where(np.isfinite(sds), sds, 0.05 * values), GROWTH.least_sd * values)
     fits = [_fit(track, trait, model, (times, values, sds)) for model in CURVES]
     return min(fits, key=lambda fit: fit.criterion)
@@ -192,9 +192,9 @@ CURVES: dict[str, Callable[[Sequence[float], Floats], Floats]] = {
 }
 
 
-def _fit(track: int, trait: str, model: str, seen: tuple[Floats, Floats, Floats]) -> GrowthCurve:
+def _fit(track: int, trait: str, model: str, sizes: tuple[Floats, Floats, Floats]) -> GrowthCurve:
     """One model through (times, values, sds), from two starts."""
-    times, values, sds = seen
+    times, values, sds = sizes
     span, largest, shape = times[-1] - times[0], float(values.max()), CURVES[model]
     count = 1 if model == "constant" else 3
     steady = largest if model != "expolinear" else max(float(np.ptp(values)), 0.02 * largest) / span

@@ -100,7 +100,7 @@ class Pair:
         days: between the dates, > 0.
         knows_up: +z is up in both frames.
         scale: what places are measured in, see `Pair.of`.
-        said: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
+        links: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
     """
 
     first: DateLeaves
@@ -108,11 +108,11 @@ class Pair:
     days: float
     knows_up: bool
     scale: float
-    said: Floats
+    links: Floats
 
     @classmethod
     def of(
-        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, said: Floats | None = None
+        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, links: Floats | None = None
     ) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
@@ -122,7 +122,7 @@ class Pair:
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
                 found += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
         nothing = np.zeros((len(first), len(second)))
-        return cls(first, second, days, knows_up, scale=max(found), said=nothing if said is None else said)
+        return cls(first, second, days, knows_up, scale=max(found), links=nothing if links is None else links)
 
     @property
     def fewer(self) -> int:
@@ -135,5 +135,5 @@ class Pair:
 
     def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
         """Some leaves of either date, with a scale of their own."""
-        first, second, said = self.first.take(rows), self.second.take(columns), self.said[np.ix_(rows, columns)]
-        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, said=said)
+        first, second, links = self.first.take(rows), self.second.take(columns), self.links[np.ix_(rows, columns)]
+        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, links=links)

@@ -66,7 +66,7 @@ class Chosen:
 
 
 @dataclass(frozen=True, eq=False)
-class Said:
+class Statements:
     """Edits of the user about D masks.
 
     Attributes:
@@ -80,14 +80,14 @@ class Said:
     leaf: Ints
 
     @staticmethod
-    def nothing(num_masks: int) -> Said:
+    def nothing(num_masks: int) -> Statements:
         """Statements about no mask."""
-        return Said(np.zeros(num_masks, bool), np.zeros(num_masks, bool), np.full(num_masks, -1))
+        return Statements(np.zeros(num_masks, bool), np.zeros(num_masks, bool), np.full(num_masks, -1))
 
     @staticmethod
-    def of(num_masks: int, rows: Ints, *, is_held: Tensor, is_sure: Tensor, leaf: Tensor) -> Said:
+    def of(num_masks: int, rows: Ints, *, is_held: Tensor, is_sure: Tensor, leaf: Tensor) -> Statements:
         """Statements about some rows of a table."""
-        said = Said.nothing(num_masks)
+        said = Statements.nothing(num_masks)
         said.is_held[rows], said.is_sure[rows], said.leaf[rows] = is_held, is_sure, leaf
         return said
 
@@ -140,25 +140,25 @@ def choose(
     *,
     drawn: Sequence[Drawn],
     usable: Bools | None = None,
-    said: Said | None = None,
+    statements: Statements | None = None,
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
 ) -> Chosen:
     """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
     hide those behind them in the next."""
     scores = table.detection_scores.double().numpy()
-    said = said or Said.nothing(len(table))
+    statements = statements or Statements.nothing(len(table))
     excluded = ~same_class(candidates, table)
     if usable is not None:
         excluded |= ~usable[:, None]
-    excluded |= said.is_of_others[:, None] & candidates.is_certain
+    excluded |= statements.is_of_others[:, None] & candidates.is_certain
     hides, ranked = np.zeros(len(candidates), bool), None
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
         q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
         q[excluded] = 0
         steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
-        ranked = _accept(candidates, q, steps, said, min_probability)
+        ranked = _accept(candidates, q, steps, statements, min_probability)
         hides = candidates.is_credible & np.isin(np.arange(len(candidates)), ranked.leaves)
         if not hides.any():
             break
@@ -167,14 +167,14 @@ def choose(
 
 
 def _accept(
-    candidates: Candidates, q: Floats, steps: Sequence[Step], said: Said, min_probability: float | None
+    candidates: Candidates, q: Floats, steps: Sequence[Step], statements: Statements, min_probability: float | None
 ) -> _Ranked:
     """Which candidates are leaves: those that are likely enough, and have masks enough, and what the user says."""
     least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
     is_taken = candidates.is_certain.copy()
     for each in steps:
         is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
-    as_seen = said.candidates_as_seen(q, is_taken)
+    as_seen = statements.candidates_as_seen(q, is_taken)
     stays = candidates.is_certain | np.isin(np.arange(len(candidates)), as_seen)
     leaves = np.array([each.candidate for each in steps if (is_taken | stays)[each.candidate]], np.int64)
     certain = candidates.certain[:, leaves] | (as_seen[:, None] == leaves)

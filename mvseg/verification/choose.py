@@ -25,7 +25,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choice import Chosen, Said, choose
+from mvseg.verification.choice import Chosen, Statements, choose
 from mvseg.verification.evidence import Bools, Drawn, Floats, draw_views
 from mvseg.verification.leaf_scores import Candidates
 from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
@@ -33,7 +33,7 @@ from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
 
 
 @dataclass(frozen=True, eq=False)
-class LeftOut:
+class RejectedCandidate:
     """A candidate that was not chosen: its P, and the masks that would show it, on the CPU, at most one in a view."""
 
     chance: float
@@ -50,7 +50,7 @@ class Leaves:
             of these, the ones that show no leaf have -1.
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
-        left: the candidates that were not chosen, the most likely first.
+        rejected: the candidates that were not chosen, the most likely first.
         agreement: share of a leaf's expected area that its masks show; mean over the leaves that have
             a surface, NaN without any. Pieces of leaves, whose ids mix, have little.
     """
@@ -58,7 +58,7 @@ class Leaves:
     masks: Masks
     surfaces: dict[int, LeafSurface]
     probabilities: dict[int, float]
-    left: tuple[LeftOut, ...]
+    rejected: tuple[RejectedCandidate, ...]
     agreement: float = float("nan")
 
 
@@ -69,7 +69,7 @@ def choose_leaves(
     cameras: Cameras,
     more: Sequence[Masks] = (),
     gone: Masks | None = None,
-    seen: Tensor | None = None,
+    previous: Tensor | None = None,
     drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
     cache: SurfaceCache | None = None,
@@ -87,7 +87,8 @@ def choose_leaves(
         more: masks of other matchings, of more of the proposals, with such labels, too.
         gone: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the user's
             masks are candidates here, and `more` has the others.
-        seen: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1 elsewhere.
+        previous: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1
+        elsewhere.
             None: for none.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
@@ -98,8 +99,8 @@ def choose_leaves(
     """
     matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
     proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
-    seen = torch.full_like(matched.instance_ids, -1) if seen is None else seen.cpu()
-    ids, origin, stays = matched.instance_ids, matched.origin, seen > 0
+    previous = torch.full_like(matched.instance_ids, -1) if previous is None else previous.cpu()
+    ids, origin, stays = matched.instance_ids, matched.origin, previous > 0
     is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
     is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # an edit only says which leaf it does not show
     is_sure = is_held & ~is_apart
@@ -108,7 +109,7 @@ def choose_leaves(
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
     table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
-    said = Said.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=seen)
+    said = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
     usable = np.ones(len(table), bool)
     if gone is not None:
         ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
@@ -126,7 +127,7 @@ def choose_leaves(
     for each in views:
         own = is_made[each.rows]
         usable[each.rows] &= own | ~each.is_shared[:, own].any(1)
-    chosen = choose(candidates, table, drawn=views, usable=usable, said=said, min_probability=min_probability)
+    chosen = choose(candidates, table, drawn=views, usable=usable, statements=said, min_probability=min_probability)
     return _take(chosen, candidates, table, is_held=said.is_sure)
 
 
@@ -178,7 +179,7 @@ def _without(proposals: Masks, others: Masks) -> Bools:
 
 
 def gather_candidates(
-    found: Sequence[tuple[Masks, Tensor]],
+    matched: Sequence[tuple[Masks, Tensor]],
     cameras: Cameras | None,
     *,
     table: Masks,
@@ -189,7 +190,7 @@ def gather_candidates(
     """The instances of each matching; those that an earlier one has, too, once.
 
     Args:
-        found: masks of each matching and (D,) their rows in the table.
+        matched: masks of each matching and (D,) their rows in the table.
         cameras: that surfaces are fitted with; None: no surfaces.
         table: R' masks.
         is_held: (D,) bool, of the masks of the first matching.
@@ -199,7 +200,7 @@ def gather_candidates(
     shapes: list[LeafSurface | None] = []
     members: list[Tensor] = []  # rows of the table, of each candidate
     columns, certain = [], []
-    for number, (masks, rows) in enumerate(found):
+    for number, (masks, rows) in enumerate(matched):
         ids = masks.instance_ids
         instances = ids[ids > 0].unique().tolist()
         new = [each for each in instances if not _is_there(rows[ids == each], members, areas)]
@@ -270,8 +271,8 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
         masks=masks,
         surfaces={number: each for number, each in enumerate(shown, 1) if each is not None and each.is_credible},
         probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
-        left=tuple(
-            LeftOut(each.chance, table.select(torch.from_numpy(each.rows)))
+        rejected=tuple(
+            RejectedCandidate(each.chance, table.select(torch.from_numpy(each.rows)))
             for each in chosen.steps
             if each.candidate not in taken and len(each.rows)
         ),

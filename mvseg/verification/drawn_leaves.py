@@ -172,11 +172,11 @@ def _fit(
     return best
 
 
-def _find_parts(left: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
+def _find_parts(remaining: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
     """{view: largest remaining part around the leaf's place}."""
     found = {}
-    for view in left:
-        place = Crop.of(left[view] & around[view]) if (left[view] & around[view]).any() else None
+    for view in remaining:
+        place = Crop.of(remaining[view] & around[view]) if (remaining[view] & around[view]).any() else None
         part = None if place is None else _largest_part(np.pad(place.pixels.numpy(), 1))[1:-1, 1:-1]
         if place is not None and part is not None and int(part.sum()) >= EVIDENCE.open_pixels:
             found[view] = replace(place, pixels=torch.from_numpy(part.copy())).tighten()

@@ -19,7 +19,7 @@ from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 from synthetic import cameras_at
 
 WIDTH, HEIGHT = 60, 40
@@ -263,8 +263,8 @@ def test_an_outline_over_everything_says_what_it_replaces() -> None:
 def test_saying_no_where_no_mask_is_answers_a_question() -> None:
     """A candidate goes, if it is no leaf in any photo; where a surface promises a mask, none is right. Elsewhere it is
     a mistake."""
-    candidate = LeftOut(0.3, Masks.of(regions_from_label_maps([label_map((40, 25, 55, 35)), label_map()])))
-    other = LeftOut(0.2, Masks.of(regions_from_label_maps([label_map((1, 25, 9, 35)), label_map()])))
+    candidate = RejectedCandidate(0.3, Masks.of(regions_from_label_maps([label_map((40, 25, 55, 35)), label_map()])))
+    other = RejectedCandidate(0.2, Masks.of(regions_from_label_maps([label_map((1, 25, 9, 35)), label_map()])))
     corrected = correct(
         at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
     )

@@ -103,7 +103,7 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     assert plant.instances.probabilities == before.instances.probabilities
     assert plant.image_size == before.image_size  # the detector learns from there
     assert torch.equal(plant.boxes, before.boxes)
-    assert [each.chance for each in plant.left] == [each.chance for each in before.left]
+    assert [each.chance for each in plant.rejected] == [each.chance for each in before.rejected]
     for state, other in ((plant, before), (apply_edits(plant, reject), apply_edits(before, reject))):
         np.testing.assert_array_equal(as_painted(state), as_painted(other))
     fewer = open_photos(SCENE.select(torch.arange(5)))
@@ -183,7 +183,7 @@ def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.Mo
     found = apply_edits(plant, Corrections((edit,)))
     assert used == [ahead]
     assert found.instances.probabilities == expected.instances.probabilities
-    assert [each.chance for each in found.left] == [each.chance for each in expected.left]
+    assert [each.chance for each in found.rejected] == [each.chance for each in expected.rejected]
     for name in ("instance_ids", "match_scores", "origin"):
         assert torch.equal(getattr(found.masks, name), getattr(expected.masks, name))
     assert torch.equal(found.masks.regions.crops, expected.masks.regions.crops)

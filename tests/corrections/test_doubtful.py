@@ -14,7 +14,7 @@ from known_leaves import make_surface
 from mvseg.corrections.doubtful import Doubt, best_mask, list_doubts
 from mvseg.corrections.numbers import DOUBTS
 from mvseg.masks import Masks, Origin
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 TRUE = true_maps()
@@ -137,11 +137,11 @@ def test_the_best_mask_is_the_largest_of_the_sure_ones() -> None:
     assert best_mask(masks, 7, but=-1) == -1
 
 
-def leave_out(leaf: int, chance: float, *views: int) -> LeftOut:
+def leave_out(leaf: int, chance: float, *views: int) -> RejectedCandidate:
     """The true masks of a leaf in some views, as a candidate that was not chosen."""
     masks = masks_of(TRUE)
     keep = (masks.instance_ids == leaf) & torch.isin(masks.view_index, torch.tensor(views))
-    return LeftOut(chance, masks.select(keep))
+    return RejectedCandidate(chance, masks.select(keep))
 
 
 def without(leaf: int) -> Masks:
@@ -150,7 +150,7 @@ def without(leaf: int) -> Masks:
 
 def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
-    found = list_doubts(without(2), surfaces, cameras=CAMERAS, left=(leave_out(2, 0.4, 0, 2, 4),))
+    found = list_doubts(without(2), surfaces, cameras=CAMERAS, rejected=(leave_out(2, 0.4, 0, 2, 4),))
     (asked,) = [each for each in found if each.kind == "leaf"]
     assert sorted(view for view, _ in asked.outlines) == [0, 2, 4]
     assert (asked.view, asked.region, asked.instance) == (asked.outlines[0][0], -1, -1)
@@ -164,13 +164,13 @@ def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
 def test_unlikely_candidates_those_of_one_view_and_those_that_have_masks_are_not_asked_about() -> None:
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
     left = leave_out(2, 0.09, 0, 2, 4), leave_out(2, 0.5, 3), leave_out(1, 0.5, 0, 1, 2)
-    assert list_doubts(without(2), surfaces, cameras=CAMERAS, left=left) == []
+    assert list_doubts(without(2), surfaces, cameras=CAMERAS, rejected=left) == []
 
 
 def test_what_is_likelier_and_larger_is_asked_first() -> None:
     nothing = masks_of([np.where(labels == 1, labels, 0) for labels in TRUE])
     left = leave_out(3, 0.2, 0, 1), leave_out(2, 0.4, 0, 1)
-    found = [each for each in list_doubts(nothing, None, cameras=CAMERAS, left=left) if each.kind == "leaf"]
+    found = [each for each in list_doubts(nothing, None, cameras=CAMERAS, rejected=left) if each.kind == "leaf"]
     assert [each.doubt for each in found] == sorted((each.doubt for each in found), reverse=True)
     assert len(found) == 2
 

@@ -114,7 +114,7 @@ def test_a_duplicate_and_a_stray_instance_fall() -> None:
     ids = torch.cat((IDS, copy_ids + 3, torch.full((len(strays),), 7)))
     leaves = choose(matched_of(proposals, ids), proposals)
     assert same_partition(leaves)
-    assert all(each.chance < 0.5 for each in leaves.left)
+    assert all(each.chance < 0.5 for each in leaves.rejected)
 
 
 def test_two_masks_of_one_photo_never_show_the_same_pixels() -> None:
@@ -196,7 +196,7 @@ def test_what_is_said_of_a_leaf_that_stays_as_it_was_seen_changes_no_other_mask(
     """Bit for bit, but that the mask is certain now, and the leaf."""
     plain = choose(matched_of(PROPOSALS, IDS))
     moved = said_of(3, IDS % 3 + 1)
-    same = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), seen=IDS)
+    same = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), previous=IDS)
     said = same.masks.regions.labels == 3
     (leaf,) = same.masks.instance_ids[said].tolist()
     assert torch.equal(plain.masks.regions.labels, same.masks.regions.labels)
@@ -215,7 +215,7 @@ def test_a_cut_mask_of_a_leaf_that_stays_as_it_was_seen_stays_in_it() -> None:
     first = matched_of(PROPOSALS, IDS)
     cut = replace(first, regions=replace(as_regions(maps)[0], labels=torch.arange(len(IDS))))
     cut.origin[row] = Origin.CONFIRMED
-    leaves = choose(cut, gone=PROPOSALS.select(IDS < 0), more=(first,), seen=IDS)
+    leaves = choose(cut, gone=PROPOSALS.select(IDS < 0), more=(first,), previous=IDS)
     assert same_partition(leaves, maps)
 
 

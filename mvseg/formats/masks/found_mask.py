@@ -28,20 +28,20 @@ class FoundMask:
 
 
 def check_categories(
-    counts: Mapping[str, int], wanted: Collection[str], *, known: Collection[str] = (), source: Path
+    counts: Mapping[str, int], wanted: Collection[str], *, categories: Collection[str] = (), source: Path
 ) -> None:
     """Warn (InputWarning) if masks of several categories are treated alike, and if no mask is of a wanted one.
 
     Args:
         counts: how many masks each category has.
         wanted: the requested categories; empty for all.
-        known: categories that the file lists, with or without masks.
+        categories: categories that the file lists, with or without masks.
         source: the file or folder; messages name it.
 
     Raises:
         InputError: a wanted category is not there.
     """
-    present = [name for name in dict.fromkeys([*known, *counts]) if name]
+    present = [name for name in dict.fromkeys([*categories, *counts]) if name]
     for name in wanted:
         if name not in present:
             there = ", ".join(present) or "none"

@@ -22,7 +22,7 @@ from mvseg.formats.masks.yolo import YOLO_TRACKS, read_class_names, read_yolo
 from mvseg.scene import Scene
 
 
-def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
+def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
     """The masks of each view in turn, in the frame of its photo: see `stack_views`.
 
     At the end, warns (InputWarning) of entries without a mask, of numbers that are ignored, and of several categories
@@ -34,11 +34,11 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
     """
     counts: Counter[str] = Counter()
     num_boxes = num_borders = 0
-    if found.kind == YOLO_TRACKS:
-        warn(Finding("confidence_and_track", str(found.source)))
-    for view in range(len(found.files)):
+    if files.kind == YOLO_TRACKS:
+        warn(Finding("confidence_and_track", str(files.source)))
+    for view in range(len(files.files)):
         try:
-            content = read_photo_masks(found.files[view], found.kind, scene.cameras.sizes[view].tolist())
+            content = read_photo_masks(files.files[view], files.kind, scene.cameras.sizes[view].tolist())
         except InputError as error:
             turn = describe_turn(scene.views[view].path)
             raise InputError(f"{error} (view {view}{turn})") from None
@@ -51,14 +51,14 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
         taken = [each for each in content if not wanted or each.category in wanted]
         yield [(each.label, each.mask) for each in taken if each.mask is not None]
     if num_borders:
-        warn(Finding("border_ignored", str(found.source), {"count": num_borders}))
+        warn(Finding("border_ignored", str(files.source), {"count": num_borders}))
     if num_boxes:
         what = f"{num_boxes} entries are boxes, lines, points or to be ignored"
         if not counts.total():
-            raise InputError(f"{found.source}: {what}, and none is a mask")
-        warn(Finding("boxes_left_out", str(found.source), {"count": num_boxes}))
+            raise InputError(f"{files.source}: {what}, and none is a mask")
+        warn(Finding("boxes_left_out", str(files.source), {"count": num_boxes}))
     if any(map(bool, counts)) or wanted:
-        check_categories(counts, wanted, source=found.source)
+        check_categories(counts, wanted, source=files.source)
 
 
 def read_photo_masks(paths: Sequence[Path], kind: str, size: Sequence[int]) -> np.ndarray | list[FoundMask]:

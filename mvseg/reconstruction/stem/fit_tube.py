@@ -211,15 +211,15 @@ def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats)
     return crop_ious(masks, drawn >= 0.5)
 
 
-def _caps(seen: Ribbon) -> Floats:
+def _caps(ribbon: Ribbon) -> Floats:
     """(S, 2) pixels by which the round ends reach beyond those of the axis, per world unit of the radius."""
-    return np.asarray((seen.per_radius * np.sqrt(np.maximum(1 - seen.sine**2, 0)))[:, ENDS])
+    return np.asarray((ribbon.per_radius * np.sqrt(np.maximum(1 - ribbon.sine**2, 0)))[:, ENDS])
 
 
-def _tips(seen: Ribbon, radius: Floats) -> tuple[Floats, Floats]:
+def _tips(ribbon: Ribbon, radius: Floats) -> tuple[Floats, Floats]:
     """(S, 2, 2) where both ends of a tube with radii (M,) end in the images, and unit vectors (S, 2, 2) outwards."""
-    ahead = _unit(seen.ahead[:, ENDS]) * np.array([[-1.0], [1.0]])
-    return seen.px[:, ENDS] + (_caps(seen) * np.maximum(radius[ENDS], 0))[..., None] * ahead, ahead
+    ahead = _unit(ribbon.ahead[:, ENDS]) * np.array([[-1.0], [1.0]])
+    return ribbon.px[:, ENDS] + (_caps(ribbon) * np.maximum(radius[ENDS], 0))[..., None] * ahead, ahead
 
 
 def _start_in_hull(masks: MaskStack) -> Floats | None:

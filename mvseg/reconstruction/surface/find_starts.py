@@ -92,7 +92,7 @@ class _Found:
 
 
 def _try_starts(
-    tried: Mapping[int, list[Floats]], few: Sequence[MaskStack], found: Mapping[int, _Found]
+    tried: Mapping[int, list[Floats]], few: Sequence[MaskStack], best: Mapping[int, _Found]
 ) -> dict[int, _Found]:
     """What is found of the leaves that are tried: their starts moved half the way to the masks, and those of them all
     of the way that may become the best."""
@@ -103,7 +103,7 @@ def _try_starts(
     stacks = [few[index] for index in leaf]
     halves, _ = approach_patches(join_stacks(stacks), halves, steps=FIRST_HALF)
     scores = _ranks(stacks, halves) - _area_costs(halves)
-    most = {index: max(found[index].half_way, scores[leaf == index].max()) for index in tried}
+    most = {index: max(best[index].half_way, scores[leaf == index].max()) for index in tried}
     goes_on = scores > np.array([most[index] for index in leaf]) - SEARCH.hopeless
     patches, ends, is_good = halves[goes_on], scores[goes_on], goes_on[goes_on]
     if goes_on.any():
@@ -115,7 +115,7 @@ def _try_starts(
         ends, is_good = ranks - _area_costs(patches), ranks + SEARCH.forgiven * explained > SEARCH.good_iou
     answers = {}
     for index in tried:
-        before, own = found[index], leaf[goes_on] == index
+        before, own = best[index], leaf[goes_on] == index
         answers[index] = _Found(
             patches=(*before.patches, *patches[own]),
             scores=(*before.scores, *ends[own].tolist()),

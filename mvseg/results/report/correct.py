@@ -99,7 +99,8 @@ def describe_doubts(result: Result, pictures: Sequence[Picture]) -> list[dict[st
     photos = result.photos if result.photos is not None and result.photos.exist else None
     return [
         _describe_doubt(doubt, pictures, cameras.sizes.tolist())
-        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, left=result.left, photos=photos)
+        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected,
+        photos=photos)
     ]
 
 

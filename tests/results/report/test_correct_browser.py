@@ -19,7 +19,7 @@ from mvseg.corrections.file import load_corrections, parse_corrections
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.results.report.page import write_report
 from mvseg.results.result import Instances, Result
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import RejectedCandidate
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
 
@@ -454,8 +454,8 @@ def offered(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the balls without the third, which is a candidate that was not chosen."""
     is_third = balls.masks.instance_ids == 3
     masks = balls.masks.select(~is_third).close_gaps()
-    left = (LeftOut(0.4, balls.masks.select(is_third)),)
-    result = replace(balls, matching=balls.matching.with_masks(masks), instances=Instances(), left=left)
+    left = (RejectedCandidate(0.4, balls.masks.select(is_third)),)
+    result = replace(balls, matching=balls.matching.with_masks(masks), instances=Instances(), rejected=left)
     return write_page(tmp_path_factory.mktemp("offered") / "report.html", result)
 
 
