@@ -244,8 +244,9 @@ def _find_doubts(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator
             yield Finding("pot_guessed", pair, {"likely": f"{chance:.0%}" if chance >= 0.01 else "less than 1%"})
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
-            pair, code = f"{dates[earlier].scene} and {dates[later].scene}", "moved_apart"
-            yield Finding(code if motion.is_sure else f"{code}_unsure", pair, {"count": len(motion.pairs)})
+            pair = f"{dates[earlier].scene} and {dates[later].scene}"
+            code = "moved_apart" if motion.is_sure else "moved_apart_unsure"
+            yield Finding(code, pair, {"count": len(motion.pairs)})
     if not all(date.knows_up for date in dates):
         yield Finding("dates_without_up")
     if shapeless := sum(len(date.leaves) - len(date.shaped) for date in dates):
