@@ -75,7 +75,7 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
         return None
     scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
-    found = find_leaves([detect_scene(Photos(scene), DetectConfig(image_size=size))], scene.cameras)
+    found = find_leaves(detect_scene(Photos(scene), DetectConfig(image_size=size)), scene.cameras)
     table, matched = found.proposals, found.matched
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],
@@ -158,6 +158,7 @@ def fit(studies: list[Study]) -> LeafScores:
             matched=regress(FITTED.matched, np.concatenate(matched[0]), np.concatenate(matched[1])),
             leaf=regress(FITTED.leaf, np.array(leaves[True][0]), np.array(leaves[True][1])),
             found=regress(FITTED.found, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
+            finer=FITTED.finer,
         )
     return fitted
 

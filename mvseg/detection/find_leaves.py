@@ -127,45 +127,69 @@ class PassResult:
 
 
 def find_leaves(
-    passes: Sequence[Pass],
+    detected: Pass,
     cameras: Cameras,
     *,
     config: DetectConfig = DetectConfig(),
     splits: bool = False,
     cache: SurfaceCache | None = None,
 ) -> PassResult:
-    """The views choose leaves and masks from everything that one or more passes propose, see `choose_leaves`.
+    """The views choose leaves and masks from everything that a pass proposes, see `choose_leaves`.
 
     Args:
-        passes: at the same photos, matched with the same cameras.
+        detected: matched with the same cameras.
         config: `verify`, `min_score` and `min_probability`.
         splits: cut masks that seem to show two leaves, before the views choose.
     """
-    matched, proposals, offset = [], [], 0
-    for each in passes:
-        own = each.proposals(cameras)
-        tables = [each.sure.masks.to("cpu")]
-        if config.verify:
-            with collect_warnings():  # said of the sure ones already
-                tables.append(each.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
-        numbered = [replace(table.regions, labels=table.regions.labels + offset) for table in tables]
-        matched += [replace(table, regions=regions) for table, regions in zip(tables, numbered, strict=True)]
-        proposals.append(own)
-        offset += len(own)
-    everything = proposals[0] if len(proposals) == 1 else Masks.concatenate(proposals)
-    first = split_merged(matched[0]).close_gaps() if splits else matched[0]
-    matched[0] = first
-    leaves = Leaves(first, {}, {}, ())
+    proposals, first = detected.proposals(cameras), detected.sure.masks.to("cpu")
+    matched = [split_merged(first).close_gaps() if splits else first]
     if config.verify:
-        with timed("choose"):
-            leaves = choose_leaves(
-                first,
-                everything,
-                cameras=cameras,
-                more=matched[1:],
-                min_probability=config.min_probability,
-                cache=cache,
-            )
-    sides = cameras.sizes if passes[0].boxes is None else passes[0].boxes[:, 2:] - passes[0].boxes[:, :2]
-    pixel = int(sides.max()) / passes[0].longest
-    return PassResult(tuple(passes), leaves, everything, tuple(matched), passes[0].sure.report, pixel)
+        with collect_warnings():  # said of the sure ones already
+            matched.append(detected.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
+    sides = cameras.sizes if detected.boxes is None else detected.boxes[:, 2:] - detected.boxes[:, :2]
+    pixel = int(sides.max()) / detected.longest
+    nothing = Leaves(matched[0], {}, {}, ())
+    result = PassResult((detected,), nothing, proposals, tuple(matched), detected.sure.report, pixel)
+    return _choose(result, cameras, config=config, cache=cache) if config.verify else result
+
+
+def join_passes(
+    first: PassResult,
+    second: PassResult,
+    cameras: Cameras,
+    *,
+    config: DetectConfig = DetectConfig(),
+    cache: SurfaceCache | None = None,
+) -> PassResult:
+    """The views choose from the proposals of two passes over the same photos, at different sizes, as one set: masks
+    that the detector saw finer are likelier (`LeafScores.finer`)."""
+    sets = [
+        replace(each.proposals, resolution=each.proposals.regions.areas.float().sqrt() / each.pixel)
+        for each in (first, second)
+    ]
+    offset = len(first.proposals)
+    shifted = [
+        replace(each, regions=replace(each.regions, labels=each.regions.labels + offset)) for each in second.matched
+    ]
+    both = replace(
+        first,
+        passes=(*first.passes, *second.passes),
+        proposals=Masks.concatenate(sets),
+        matched=(*first.matched, *shifted),
+    )
+    return _choose(both, cameras, config=config, cache=cache)
+
+
+def _choose(
+    result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None
+) -> PassResult:
+    with timed("choose"):
+        leaves = choose_leaves(
+            result.matched[0],
+            result.proposals,
+            cameras=cameras,
+            more=result.matched[1:],
+            min_probability=config.min_probability,
+            cache=cache,
+        )
+    return replace(result, leaves=leaves)

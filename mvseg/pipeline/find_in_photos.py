@@ -13,7 +13,7 @@ from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
-from mvseg.detection.find_leaves import PassResult, find_leaves
+from mvseg.detection.find_leaves import PassResult, find_leaves, join_passes
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
@@ -45,7 +45,7 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
 
     found = choose_size(see, first)
     if few is opened:
-        return plant_of_pass(opened, found[0])
+        return plant_of_pass(opened, _choose_pass(opened, found, detect))
     if boxes is not None:
         masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
@@ -62,9 +62,19 @@ def _run_in_all(
     cache: CachedDetections | None,
     boxes: Tensor | None,
 ) -> PassResult:
-    """What all views find at that one of the sizes where their agreed area is largest; None is the detector's own."""
-    seen = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return max(seen, key=lambda each: each.agreed_area)
+    """Run the detector over all views at one or two sizes (None: its own), and choose."""
+    results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
+    return _choose_pass(opened, sorted(results, key=lambda each: -each.agreed_area), detect)
+
+
+def _choose_pass(opened: Opened, results: Sequence[PassResult], detect: DetectConfig) -> PassResult:
+    """Of one or two passes, the better one first, that one, or both as one set: where the agreed area is largest."""
+    best, *others = results
+    for other in others:
+        with collect_warnings():  # those of the passes say it
+            both = join_passes(best, other, opened.scene.cameras, config=detect, cache=opened.surfaces)
+        best = max(best, both, key=lambda each: each.agreed_area)
+    return best
 
 
 def _select_judges(opened: Opened) -> tuple[Opened, Tensor]:
@@ -90,7 +100,7 @@ def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | No
 
     found = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
-        return found[0]
+        return _choose_pass(opened, found, detect)
     return _run_in_all(opened, [each.passes[0].longest for each in found], detect, cache=cache, boxes=boxes)
 
 
@@ -109,7 +119,7 @@ def run_pass(
     with collect_warnings() as findings:
         detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
         cameras, splits = opened.scene.cameras, opened.is_cut
-        result = find_leaves([detected], cameras, config=detect, splits=splits, cache=opened.surfaces)
+        result = find_leaves(detected, cameras, config=detect, splits=splits, cache=opened.surfaces)
     return replace(result, findings=tuple(findings))
 
 

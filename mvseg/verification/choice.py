@@ -146,7 +146,7 @@ def choose(
 ) -> Chosen:
     """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
     hide those behind them in the next."""
-    scores = table.detection_scores.double().numpy()
+    scores, resolution = table.detection_scores.double().numpy(), table.resolution.double().numpy()
     statements = statements or Statements.nothing(len(table))
     excluded = ~same_class(candidates, table)
     if usable is not None:
@@ -155,7 +155,7 @@ def choose(
     hides, ranked = np.zeros(len(candidates), bool), None
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
+        q = np.round(show_chances(candidates, evidence, scores, resolution, fitted), CHOICE.digits)
         q[excluded] = 0
         steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
         ranked = _accept(candidates, q, steps, statements, min_probability)

@@ -29,19 +29,23 @@ class LeafScores:
         matched: the same for a candidate without one: see `matched_features`.
         leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
         found: the same for a candidate without one, by the first four of these features.
+        finer: log odds that a mask shows a candidate gain per logarithm of `Masks.resolution`.
     """
 
     shows: dict[str, float]
     matched: dict[str, float]
     leaf: dict[str, float]
     found: dict[str, float]
+    finer: float
 
 
+# Chosen, the last one: of 0.5, 1 and 2, with which proposals of two passes are one set (docs/notes/detector.md).
 FITTED = LeafScores(
     shows={"always": 0.656, "detection score": 0.314, "claimed": 1.431, "visible": 0.665},
     matched={"always": -1.632, "detection score": 0.958, "match score": 0.897},
     leaf={"always": -2.385, "shown": 4.382, "number": 0.913, "detection score": 1.153, "length": 1.157, "fit": 0.387},
     found={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
+    finer=1.0,
 )
 
 
@@ -104,18 +108,30 @@ class ClearLeaves:
     length: float
 
 
-def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
-    masks that were matched to a candidate can; what the user says is certain."""
-    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
+def show_chances(
+    candidates: Candidates, evidence: Evidence, scores: Floats, resolution: Floats, fitted: LeafScores = FITTED
+) -> Floats:
+    """(D, K) q: how likely each mask shows each candidate, from the detection scores and `Masks.resolution` (D,).
+    Without a surface, only the masks that were matched to a candidate can; what the user says is certain."""
+    bonus = fitted.finer * finer(resolution)[:, None]
+    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()) + bonus)
     q = np.where(np.isnan(candidates.matched), 0.0, q)
     with_surface = candidates.has_surface
     if with_surface.any():
-        by_surface = expit(shows_features(evidence, scores) @ list(fitted.shows.values())) * (evidence.claimed > 0)
+        odds = shows_features(evidence, scores) @ list(fitted.shows.values()) + bonus
+        by_surface = expit(odds) * (evidence.claimed > 0)
         q = np.where(with_surface, by_surface, q)
     q[candidates.certain.any(1)] = 0
     q[candidates.certain] = 1
     return q
+
+
+def finer(resolution: Floats) -> Floats:
+    """(D,) logarithm of the resolution over the median of all masks that have one; 0 for the others. A coarse mask must
+    not take the place of a fine one."""
+    logs = np.log(np.maximum(resolution, 1.0))
+    known = np.isfinite(logs)
+    return np.where(known, logs - np.median(logs[known]), 0.0) if known.any() else np.zeros(len(logs))
 
 
 def shows_features(evidence: Evidence, scores: Floats) -> Floats:

@@ -16,7 +16,7 @@ from mvseg import demo_scene, load_scene
 from mvseg.config import RunConfig
 from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import find_leaves
+from mvseg.detection.find_leaves import find_leaves, join_passes
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
@@ -116,10 +116,12 @@ def test_the_agreed_area_of_whole_leaves_is_larger_than_that_of_halves() -> None
     assert rate_pass(mixed, {1: 1.0, 2: 1.0}, pixel=0) == rate_pass(sure, {1: 1.0, 2: 1.0}, pixel=0) / 4
 
 
-def test_what_two_looks_propose_is_one_set() -> None:
-    """The labels of all matchings are rows of it."""
-    both = find_leaves([look_of(squares(9, side=side)) for side in (40, 20)], load_scene(demo_scene()).cameras)
-    assert len(both.proposals) == 18
+def test_what_two_passes_propose_is_one_set() -> None:
+    """The labels of all matchings are rows of it; the resolution is that of the pass."""
+    cameras = load_scene(demo_scene()).cameras
+    both = join_passes(*(find_leaves(look_of(squares(9, side=side), 640 // of), cameras)
+                         for side, of in ((40, 10), (20, 2))), cameras)  # fmt: skip
+    assert both.proposals.resolution.tolist() == pytest.approx([4.0] * 9 + [10.0] * 9)
     assert [int(each.regions.labels.min()) for each in both.matched] == [0, 0, 9, 9]
     for each in both.matched:
         assert torch.equal(each.regions.areas, both.proposals.regions.areas[each.regions.labels])
