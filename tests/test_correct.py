@@ -264,7 +264,7 @@ def surfaces_by_masks(result: Result) -> dict[tuple[str, ...], bytes]:
 def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     opened = OpenResult(folder)
     cut_off, more = (Finding("shape_cut_off", values={"count": count}) for count in (2, 3))
-    opened.run = replace(opened.run, said=opened.run.said.model_copy(update={"findings": (cut_off.as_json(),)}))
+    opened.run = replace(opened.run, record=opened.run.record.model_copy(update={"findings": (cut_off.as_json(),)}))
 
     def shape(plant: Plant, **_: object) -> Result:
         warn(more)

@@ -147,6 +147,24 @@ def test_sentences_have_a_noun_or_a_verb_at_their_head() -> None:
     assert public == []
 
 
+VAGUE = {"found", "known", "said", "seen", "shown", "left", "kept"}
+
+
+def test_vague_names_live_for_three_lines_at_most() -> None:
+    """Within a function; beside `right`, `left` is a side."""
+    lasting = set()
+    for module, source in MODULES.items():
+        for function in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)):
+            lines: dict[str, list[int]] = {}
+            for node in ast.walk(function):
+                if isinstance(node, ast.Name):
+                    lines.setdefault(node.id, []).append(node.lineno)
+            vague = VAGUE & {name for name, each in lines.items() if max(each) - min(each) > 3}
+            sides = {"left"} if {"right", "top", "top_left", "last", "width"} & lines.keys() else set()
+            lasting |= {(module, function.name, name) for name in vague - sides}
+    assert lasting == set()
+
+
 def test_public_names_are_given_once() -> None:
     """But for verbs of the command line, which have the same functions."""
     places: dict[str, list[str]] = {}

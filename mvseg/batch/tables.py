@@ -65,10 +65,10 @@ def _join(
     path: Path, columns: Sequence[str], scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]
 ) -> None:
     """Join the tables of the scenes, which have these columns, behind the cells of the batch's table."""
-    kept = [column for column in columns if column not in carried]
+    shared = [column for column in columns if column not in carried]
     rows = [
-        [*_about(scene), *(row[column] for column in kept)]
+        [*_about(scene), *(row[column] for column in shared)]
         for scene in scenes
         for row in read_csv(out / scene.name / path.name, columns)
     ]
-    write_table(path, ["scene", *carried, *kept], rows)
+    write_table(path, ["scene", *carried, *shared], rows)

@@ -87,10 +87,10 @@ def track_plants(
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     edits = () if corrections is None else load_corrections(corrections).edits
-    said: dict[str, Any] = {}
+    record: dict[str, Any] = {}
     folders = tuple(folder for plant in plants for folder in plant.folders)
     output = Output("tracks", of=folders, reads=() if corrections is None else (corrections,))
-    with replace_result(out, said, output) as folder:
+    with replace_result(out, record, output) as folder:
         places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
         places = places if len(plants) > 1 else [folder]
         work = partial(_track_plant, edits, pots=pots, report=report)
@@ -108,7 +108,7 @@ def track_plants(
                 write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
             else:
                 shutil.rmtree(folder / "plants")
-        said |= _describe_run(plants, tracked, corrections, pots)
+        record |= _describe_run(plants, tracked, corrections, pots)
     return tracked
 
 

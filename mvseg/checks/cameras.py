@@ -110,7 +110,7 @@ def _lens_rules(cameras: Cameras) -> list[Rule]:
     degrees, (least, most) = field_of_view(cameras), CAMERAS.field_of_view
     beside = np.abs(center / sizes - 0.5).max(1)
     ratio = focal.max(1) / focal.min(1)
-    found = (
+    rules = (
         ("odd_field_of_view", (degrees < least) | (degrees > most), "degrees", degrees),
         ("odd_principal_point", beside > CAMERAS.off_center, "share", beside),
         ("odd_focal_lengths", focal.max(1) > CAMERAS.square * focal.min(1), "ratio", ratio),
@@ -118,7 +118,7 @@ def _lens_rules(cameras: Cameras) -> list[Rule]:
     return [
         (code, "warning", np.flatnonzero(is_odd).tolist(),
          {name: float(value[is_odd].max(initial=0)), "least": least, "most": most})
-        for code, is_odd, name, value in found
+        for code, is_odd, name, value in rules
     ]  # fmt: skip
 
 
@@ -154,11 +154,11 @@ def _mixed_units(cameras: Cameras, coverage: Coverage) -> Rule | None:
             continue
         for factor, units in UNITS.items():
             scaled = replace(cameras, t=torch.where(is_short[:, None], factor * cameras.t, cameras.t))
-            found = find_coverage(scaled)
-            if found.sees.mean() < CAMERAS.all or _distance_ratio(scaled, found, is_short) > CAMERAS.alike:
+            groups = find_coverage(scaled)
+            if groups.sees.mean() < CAMERAS.all or _distance_ratio(scaled, groups, is_short) > CAMERAS.alike:
                 continue
             few, ratio = (is_short, 1 / factor) if 2 * place <= len(cameras) else (~is_short, float(factor))
-            views, num = few.nonzero()[:, 0].tolist(), int(found.sees.sum())
+            views, num = few.nonzero()[:, 0].tolist(), int(groups.sees.sum())
             is_sure = factor > min(UNITS) or share < CAMERAS.all
             counts: Values = {"others": len(cameras) - len(views), "num": num, "total": len(cameras)}
             return "mixed_units", "error" if is_sure else "warning", views, {**counts, "ratio": ratio, "units": units}

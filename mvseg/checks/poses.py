@@ -107,17 +107,17 @@ def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
     rest must be more than half of the views, and at least two.
     """
     num_views = len(pairs.fitting)
-    kept, off = list(range(num_views)), []
-    while len(kept) > 1:
-        fitting, offset = _against(pairs, kept)
-        is_off = [view for view in kept if fitting[view] < AGREEMENT.off and offset[view] >= AGREEMENT.offset]
+    agreeing, off = list(range(num_views)), []
+    while len(agreeing) > 1:
+        fitting, offset = _against(pairs, agreeing)
+        is_off = [view for view in agreeing if fitting[view] < AGREEMENT.off and offset[view] >= AGREEMENT.offset]
         if not is_off:
             break
         worst = min(is_off, key=lambda view: (fitting[view], -offset[view]))
-        kept.remove(worst)
+        agreeing.remove(worst)
         off.append(worst)
-    agree = len(kept) > max(1, num_views / 2)
-    fitting, offset = _against(pairs, kept if agree else list(range(num_views)))
+    agree = len(agreeing) > max(1, num_views / 2)
+    fitting, offset = _against(pairs, agreeing if agree else list(range(num_views)))
     return ViewAgreement(
         fitting=fitting, offset_px=offset * pairs.unit_px, off=tuple(sorted(off)) if agree else (), agree=agree
     )

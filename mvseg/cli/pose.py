@@ -47,7 +47,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    known = Known(
+    world = Known(
         board=args.board if args.board is None else BoardConfig(**vars(args.board)),
         marker=args.marker,
         distance=_read_distance(args.distance),
@@ -58,11 +58,11 @@ def run(args: Namespace) -> int:
     if args.turntable in (None, "board") and args.angles is not None:
         raise InputError("--angles has no effect without --turntable and a turntable.json")
     if args.turntable is not None:
-        _run_turntable(args, known, config)
+        _run_turntable(args, world, config)
         return 0
     from mvseg.runs.pose_photos import pose_photos  # keeps --help and wrong options quick
 
-    pose_photos(args.photos, args.out, config=config, world=known, up=read_up(args.up))
+    pose_photos(args.photos, args.out, config=config, world=world, up=read_up(args.up))
     return 0
 
 

@@ -39,14 +39,14 @@ def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
         (L,) int64, their ids in `before`.
     """
     must, cannot = ids[corrected.links.must.reshape(-1, 2)], ids[corrected.links.cannot.reshape(-1, 2)]
-    left, all_of = (
+    remaining, all_of = (
         torch.bincount(each.clamp(min=0), minlength=before.num_instances + 1) for each in (ids, before.instance_ids)
     )
     changed = (
         must[must[:, 0] != must[:, 1]].flatten(),
         cannot[cannot[:, 0] == cannot[:, 1]].flatten(),
         ids[[each.row for each in corrected.everywhere if each.rejects]],
-        (left != all_of).nonzero()[:, 0],
+        (remaining != all_of).nonzero()[:, 0],
         before.instance_ids[before.origin != Origin.DETECTED],  # the views did not choose these
     )
     named = ids[corrected.masks.is_corrected | corrected.masks.is_linked]

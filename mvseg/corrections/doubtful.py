@@ -88,28 +88,28 @@ def list_doubts(
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
         photos: photos of the views; None: nobody looks for places without masks.
     """
-    masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
-    found = _doubt_matches(masks)
+    masks, surfaces_of, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
+    doubts = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
-    evidence = see_instances(masks.regions, known, cameras)
+    evidence = see_instances(masks.regions, surfaces_of, cameras)
     free: list[list[int]] = [[] for _ in rejected]  # rows of each candidate's masks where none of the result lies
-    for view, size in enumerate(cameras.sizes.tolist() if known or rejected else ()):
+    for view, size in enumerate(cameras.sizes.tolist() if surfaces_of or rejected else ()):
         taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
-        if known:
-            painted = paint_view(known, cameras, view)
-            found += _doubt_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
+        if surfaces_of:
+            painted = paint_view(surfaces_of, cameras, view)
+            doubts += _doubt_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
         for rows, candidate in zip(free, rejected, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
-    found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
+    doubts += _doubt_surfaces(masks, surfaces_of) + _doubt_rare(masks, should)
     usual, areas = _usual_area(masks), masks.regions.areas.tolist()
     if photos is not None:
-        found += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=DOUBTS.half * usual), usual=usual)
-    found = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in found]
+        doubts += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=DOUBTS.half * usual), usual=usual)
+    doubts = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in doubts]
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
     queue = _doubt_left(rejected, free, usual=usual)
     place = attrgetter("view", "instance", "region")
-    for each in sorted(found, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
+    for each in sorted(doubts, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
         if each.doubt >= DOUBTS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
@@ -139,14 +139,14 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
     """Low match scores; and masks of some size that were matched to nothing."""
     ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
     usual = _usual_area(masks)
-    found = []
+    doubts = []
     for row, score in enumerate(masks.match_scores.tolist()):
         if ids[row] > 0:
-            found.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
+            doubts.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
             doubt = min(1.0, float(areas[row]) / usual)
-            found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
-    return found
+            doubts.append(Doubt("unmatched", doubt, views[row], -1, region=row))
+    return doubts
 
 
 def _usual_area(masks: Masks) -> float:
@@ -165,21 +165,21 @@ def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) ->
             halves[ids[part.row]].setdefault(part.view, part)
         if part.area >= usual:
             places.append(part)
-    found = []
+    doubts = []
     for instance, views in sorted(halves.items()):
         if len(views) < DOUBTS.least_halves:
             continue
         places = [part for part in places if part.row < 0 or ids[part.row] != instance]
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
-        found.append(
+        doubts.append(
             Doubt("half", 1.0, largest.view, instance, region=largest.row, found=len(views),
                   expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
         )  # fmt: skip
     if len({part.view for part in places}) > 1:  # two outlines are a leaf
         outlines = tuple((part.view, part.outline) for part in places[: DOUBTS.most_places])
-        found.append(Doubt("place", 1.0, outlines[0][0], -1, outlines=outlines))
-    return found
+        doubts.append(Doubt("place", 1.0, outlines[0][0], -1, outlines=outlines))
+    return doubts
 
 
 def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
@@ -195,7 +195,7 @@ def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
 def _doubt_left(rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[int]], *, usual: float) -> list[Doubt]:
     """Candidates that were not chosen, in the views where no mask of the result lies, the largest mask first; `usual`
     as `_usual_area` says."""
-    found = []
+    doubts = []
     for each, rows in zip(rejected, free, strict=True):
         if each.chance < DOUBTS.least_chance or len(rows) < CHOICE.least_views:
             continue
@@ -207,8 +207,8 @@ def _doubt_left(rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[i
             for row in (rows[place] for place in order)
         )
         doubt = each.chance * min(1.0, float(areas.median()) / usual)
-        found.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=outlines))
-    return found
+        doubts.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=outlines))
+    return doubts
 
 
 def _doubt_view(
@@ -221,7 +221,7 @@ def _doubt_view(
     """
     members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
     here = {int(masks.instance_ids[row]) for row in members}
-    found = []
+    doubts = []
     for instance, box in enumerate(find_objects(painted, max_label=len(should) - 1), 1):
         if box is None:
             continue
@@ -235,12 +235,12 @@ def _doubt_view(
         nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
         if nearest >= 0 and evidence.visible[nearest, instance] >= DOUBTS.similar:
             doubt = min(1.0, float(evidence.visible[nearest, instance]) / DOUBTS.surely)
-            found.append(Doubt("covered", doubt, view, instance, region=nearest))
+            doubts.append(Doubt("covered", doubt, view, instance, region=nearest))
         elif empty >= DOUBTS.empty:
             outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
             size = min(1.0, float(mask.sum()) / _usual_area(masks))
-            found.append(Doubt("missing", empty * share, view, instance, outlines=outlines, size=size))
-    return found
+            doubts.append(Doubt("missing", empty * share, view, instance, outlines=outlines, size=size))
+    return doubts
 
 
 def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
@@ -253,7 +253,7 @@ def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
 
 def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[Doubt]:
     """The mask of each leaf that its surface explains worst."""
-    found = []
+    doubts = []
     for instance, surface in surfaces.items():
         if not surface.exists:
             continue
@@ -262,13 +262,13 @@ def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[D
         rows = ((masks.instance_ids == instance) & (masks.view_index == view)).nonzero()[:, 0]
         if len(rows):
             row = int(rows[masks.regions.areas[rows].argmax()])
-            found.append(Doubt("surface", doubt, view, instance, region=row))
-    return found
+            doubts.append(Doubt("surface", doubt, view, instance, region=row))
+    return doubts
 
 
 def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
     """Leaves that were found in few of the views that should show them; without a credible surface, of all views."""
-    found = []
+    doubts = []
     for instance in range(1, masks.num_instances + 1):
         best = best_mask(masks, instance, but=-1)
         if best < 0:
@@ -277,5 +277,5 @@ def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
         expected = views | set(np.flatnonzero(should[instance]).tolist())
         number = len(expected) if should[instance].any() else masks.regions.num_views
         doubt, view = 1 - len(views) / number, int(masks.view_index[best])
-        found.append(Doubt("few", doubt, view, instance, region=best, found=len(views), expected=number))
-    return found
+        doubts.append(Doubt("few", doubt, view, instance, region=best, found=len(views), expected=number))
+    return doubts

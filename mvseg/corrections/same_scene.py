@@ -35,13 +35,13 @@ def with_marks(corrections: Corrections, scene: Scene, marks: Mapping[str, Photo
 def named_views(corrections: Corrections, scene: Scene) -> list[int]:
     """The indices of the views that edits of single scenes name, each once; names that fit no view, or several, are
     left to `apply`."""
-    found: dict[int, None] = {}
+    views: dict[int, None] = {}
     for name in views_of(corrections):
         with suppress(InputError):  # it fits several
             (view,) = find_views([name], scene, source=Path("corrections"))
             if view is not None:
-                found[view] = None
-    return list(found)
+                views[view] = None
+    return list(views)
 
 
 def views_of(corrections: Corrections) -> list[str]:

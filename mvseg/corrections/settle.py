@@ -30,11 +30,11 @@ def settle_edits(
     """
     gone, answers = set[int](), set[int]()
     for each in refused:
-        shown = {n for n, other in enumerate(rejected) if other.masks.regions.at(each.view, each.column, each.row)}
-        gone |= shown if each.everywhere else set()
+        candidates = {n for n, other in enumerate(rejected) if other.masks.regions.at(each.view, each.column, each.row)}
+        gone |= candidates if each.everywhere else set()
         width, height = cameras.sizes[each.view].tolist()
         is_in_photo = 0 <= each.column < width and 0 <= each.row < height
-        if shown or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
+        if candidates or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
             answers.add(each.edit)
     fates = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in edits)
     return tuple(other for n, other in enumerate(rejected) if n not in gone), fates

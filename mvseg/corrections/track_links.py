@@ -60,17 +60,18 @@ def find_links(
 
 def _without_contradicted(links: Mapping[int, LeafLink], problems: dict[int, str]) -> list[int]:
     """The places of the links that hold together, the last one first; `problems` learns the others."""
-    kept: list[int] = []
+    agreeing: list[int] = []
     for index in sorted(links, reverse=True):
         link = links[index]
-        if not _is_contradiction([link, *(links[other] for other in kept)]):
-            kept.append(index)
+        if not _is_contradiction([link, *(links[other] for other in agreeing)]):
+            agreeing.append(index)
         elif _is_contradiction([link]):
             problems[index] = f"{_op(link)}: two leaves of one date, which are never the same"
         else:
-            count = next(n for n in range(len(kept)) if _is_contradiction([link, *(links[k] for k in kept[: n + 1])]))
-            problems[index] = f"{_op(link)}: contradicted by edit {kept[count] + 1}"
-    return kept
+            held = [links[k] for k in agreeing]
+            count = next(n for n in range(len(held)) if _is_contradiction([link, *held[: n + 1]]))
+            problems[index] = f"{_op(link)}: contradicted by edit {agreeing[count] + 1}"
+    return agreeing
 
 
 def _op(link: LeafLink) -> str:

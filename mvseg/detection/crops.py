@@ -44,15 +44,15 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
         if len(views) < max(2, min(DETECTION.plant_views, len(cameras))):
             continue
         boxes = regions.boxes[members].double()
-        seen = cameras[views]
-        point = triangulate(seen.px_from_world.numpy(), ((boxes[:, :2] + boxes[:, 2:]) / 2).numpy())
-        _, depth = seen.project(torch.from_numpy(point)[None])
+        in_view = cameras[views]
+        point = triangulate(in_view.px_from_world.numpy(), ((boxes[:, :2] + boxes[:, 2:]) / 2).numpy())
+        _, depth = in_view.project(torch.from_numpy(point)[None])
         of_plant[members] = True
         if not bool((depth > 0).all()):
             continue
         half = (boxes[:, 2:] - boxes[:, :2]).amax(1) / 2
         points.append(torch.from_numpy(point))
-        radii.append((half * depth[:, 0] / seen.K[:, 0, 0]).median())
+        radii.append((half * depth[:, 0] / in_view.K[:, 0, 0]).median())
     if not points:
         return frames
     px, depth = cameras.project(torch.stack(points))

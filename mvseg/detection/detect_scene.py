@@ -84,7 +84,7 @@ def _detect(
     made_by: str,
 ) -> list[dict[str, Tensor]]:
     """What the detector finds in every photo, or in its box (V, 4) xyxy."""
-    found, scene = [], photos.scene
+    every, scene = [], photos.scene
     device = next(model.parameters()).device
     with timed("detect"):
         for view in progress_bar(range(len(scene.views)), name="detection", unit="view"):
@@ -97,8 +97,8 @@ def _detect(
                 detections = model.detect(photo.float().div_(255))
                 if path is not None:
                     write_detections(path, detections)
-            found.append(detections)
-    return found
+            every.append(detections)
+    return every
 
 
 def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:

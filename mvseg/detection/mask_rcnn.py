@@ -235,17 +235,17 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
     """torchvision's result dicts of matched masks, best score first."""
     results = []
     for view, (width, height) in enumerate(sizes):
-        shown = masks.select(masks.view_index == view)
-        shown = shown.select(shown.detection_scores.argsort(descending=True, stable=True))
-        frames = [shown.regions.mask(index, width, height) for index in range(len(shown))]
+        here = masks.select(masks.view_index == view)
+        here = here.select(here.detection_scores.argsort(descending=True, stable=True))
+        frames = [here.regions.mask(index, width, height) for index in range(len(here))]
         empty = torch.zeros((0, height, width))
         result = {
-            "boxes": shown.regions.boxes.float(),
-            "labels": shown.classes,
-            "scores": shown.detection_scores,
+            "boxes": here.regions.boxes.float(),
+            "labels": here.classes,
+            "scores": here.detection_scores,
             "masks": (torch.stack(frames).float() if frames else empty)[:, None],
-            "instance_ids": shown.instance_ids,
-            "match_scores": shown.match_scores,
+            "instance_ids": here.instance_ids,
+            "match_scores": here.match_scores,
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results

@@ -129,12 +129,12 @@ def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]
         )
     numbers = instance_ids.cpu().numpy()
     ids, instance = np.unique(separate_unmatched(numbers), return_inverse=True)
-    shown = [[label for label in np.unique(labels).tolist() if label not in (0, IGNORE_LABEL)] for labels in truth]
-    true_masks = [(view, label) for view, of_view in enumerate(shown) for label in of_view]
+    visible = [[label for label in np.unique(labels).tolist() if label not in (0, IGNORE_LABEL)] for labels in truth]
+    true_masks = [(view, label) for view, of_view in enumerate(visible) for label in of_view]
     mask_number = {key: number for number, key in enumerate(true_masks)}
     leaf_number = {label: number for number, label in enumerate(sorted({label for _, label in true_masks}))}
-    by_mask = [{label: mask_number[view, label] for label in of_view} for view, of_view in enumerate(shown)]
-    by_leaf = [{label: leaf_number[label] for label in of_view} for of_view in shown]
+    by_mask = [{label: mask_number[view, label] for label in of_view} for view, of_view in enumerate(visible)]
+    by_leaf = [{label: leaf_number[label] for label in of_view} for of_view in visible]
     return Judged(
         ids=np.where(np.isin(ids, numbers), ids, -1),
         instance=instance,

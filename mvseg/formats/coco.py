@@ -160,15 +160,15 @@ def _read_file(path: Path, scene: PhotoSet) -> CocoMasks:
 
 def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoMasks | None:
     """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
-    ids, found = {str(result.image_id) for result in results}, []
+    ids, data_set = {str(result.image_id) for result in results}, []
     for other in sorted(path.parent.glob("*.json")):
         try:
             listed = read_json(other, CocoMasks)
         except InputError:  # no COCO file, which includes the results
             continue
         if ids and ids <= {str(image.id) for image in listed.images}:
-            found.append(listed)
-    return found[0] if len(found) == 1 else None
+            data_set.append(listed)
+    return data_set[0] if len(data_set) == 1 else None
 
 
 def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) -> list[CocoImage]:
@@ -184,14 +184,14 @@ def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) ->
         by_number = {}
     ids = list(dict.fromkeys(result.image_id for result in results))
     numbers = [image_id for image_id in ids if isinstance(image_id, int)]
-    known = [number for number in numbers if number in by_number]
-    if known and len(known) < len(numbers):
+    matching = [number for number in numbers if number in by_number]
+    if matching and len(matching) < len(numbers):
         other = next(number for number in numbers if number not in by_number)
-        reason = f"image_id {known[0]} is the number of a photo, {other} is none"
+        reason = f"image_id {matching[0]} is the number of a photo, {other} is none"
         mend = "put the JSON of its data set, which lists the images, beside it"
         raise InputError(f"{path}: {reason}: image ids of results are those of their data set; {mend}")
-    if known:
-        values: Values = {"number": known[0], "photo": by_number[known[0]]}
+    if matching:
+        values: Values = {"number": matching[0], "photo": by_number[matching[0]]}
         warn(Finding("ids_taken_for_numbers", str(path), values))
     names = [by_number.get(each, str(each)) if isinstance(each, int) else each for each in ids]
     return [CocoImage(id=each, file_name=name, width=0, height=0) for each, name in zip(ids, names, strict=True)]
@@ -229,8 +229,8 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     views = find_views(names, scene, source=path, warn_of_loose=True)
     missing = [view for view in range(len(scene.views)) if view not in set(views)]
     if len(missing) == len(scene.views):
-        photos, found = list_some([view.path.name for view in scene.views]), list_some(names)
-        raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {found}")
+        photos, images = list_some([view.path.name for view in scene.views]), list_some(names)
+        raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {images}")
     if missing:
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         counts: Values = {"count": len(missing), "first": first_view, "found": tuple(names)}
@@ -239,8 +239,8 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     for image, view in zip(coco.images, views, strict=True):
         width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
         if view is not None and (image.width, image.height) not in ((0, 0), (width, height)):  # 0 x 0: not known
-            found = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
-            raise InputError(f"{path}: {found}{describe_turn(scene.views[view].path)}")
+            images = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
+            raise InputError(f"{path}: {images}{describe_turn(scene.views[view].path)}")
     return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
 
 

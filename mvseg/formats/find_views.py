@@ -47,24 +47,24 @@ def find_views(
         InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
     """
     in_source = "" if source is None else f"{source}: "
-    found = _exact_views(names, scene, in_source)
-    open_views = [view for view in range(len(scene.views)) if view not in set(found)]
+    places = _exact_views(names, scene, in_source)
+    open_views = [view for view in range(len(scene.views)) if view not in set(places)]
     bases = [base_name(scene.views[view].name) for view in open_views]
     view_of = {base: view for base, view in zip(bases, open_views, strict=True) if bases.count(base) == 1}
     first_of: dict[int, str] = {}
     for index, name in enumerate(names):
-        view = view_of.get(base_name(name)) if found[index] is None else None
+        view = view_of.get(base_name(name)) if places[index] is None else None
         if view is None:
             continue
         if first_of.setdefault(view, name) != name:
             message = f"both {first_of[view]} and {name} could be view {view} ({scene.views[view].name})"
             raise InputError(f"{in_source}{message}, expected the path of its photo")
-        found[index] = view
+        places[index] = view
     if first_of and warn_of_loose:
         view, name = next(iter(first_of.items()))
         first = f"{name} for {scene.views[view].name}"
         warn(Finding("base_names", str(source), {"count": len(first_of), "first": first}))
-    return found
+    return places
 
 
 def base_name(name: str) -> str:
@@ -108,7 +108,7 @@ def _exact_views(names: Sequence[str], scene: PhotoSet, in_source: str) -> list[
         parts = composed(view.path.as_posix()).split("/")
         for start in range(len(parts)):
             by_path["/".join(parts[start:])].append(index)
-    found: list[int | None] = []
+    exact: list[int | None] = []
     for file_name in names:
         name = composed(file_name).replace("\\", "/").removeprefix("./")
         stem = name.rsplit(".", 1)[0]
@@ -117,5 +117,5 @@ def _exact_views(names: Sequence[str], scene: PhotoSet, in_source: str) -> list[
         if len(fitting) > 1:
             views = " or ".join(f"{i} ({scene.views[i].name})" for i in fitting)
             raise InputError(f"{in_source}image {file_name} could be view {views}, expected its path")
-        found.append(fitting[0] if fitting else same_name)
-    return found
+        exact.append(fitting[0] if fitting else same_name)
+    return exact

@@ -55,14 +55,14 @@ def find_turn(data: bytes) -> int:
 def _linked(links: bytes, item: int) -> set[int]:
     """The numbers of an item's properties, from the content of a box `ipma`."""
     id_bytes, link_bytes = (4 if links[0] else 2), (2 if links[3] & 1 else 1)
-    found, at = set(), 8
+    items, at = set(), 8
     for _ in range(int.from_bytes(links[4:8])):
         owner, count = int.from_bytes(links[at : at + id_bytes]), links[at + id_bytes]
         start, at = at + id_bytes + 1, at + id_bytes + 1 + count * link_bytes
         if owner == item:  # the upper bit of a number says whether a reader must understand the property
             parts = [links[place : place + link_bytes] for place in range(start, at, link_bytes)]
-            found |= {int.from_bytes(part) & (0x7FFF if link_bytes == 2 else 0x7F) for part in parts}
-    return found
+            items |= {int.from_bytes(part) & (0x7FFF if link_bytes == 2 else 0x7F) for part in parts}
+    return items
 
 
 def _content(data: bytes, kind: bytes) -> bytes:

@@ -245,19 +245,19 @@ def is_turned(path: Path) -> bool:
 def _orientation_of(image: ImageFile) -> int:
     """Of an image that has been opened, not decoded."""
     if isinstance(image, TiffImageFile):
-        said = image.tag_v2.get(ORIENTATION)
+        tag = image.tag_v2.get(ORIENTATION)
     elif isinstance(image, PngImageFile):  # whose own method decodes it, to find a chunk behind the pixels
         exif = Image.Image.getexif(image)
         if ORIENTATION not in exif and image.fp is not None:
             at = image.fp.tell()
             exif.load(_find_chunk(image.fp, b"eXIf"))
             image.fp.seek(at)
-        said = exif.get(ORIENTATION)
+        tag = exif.get(ORIENTATION)
     elif TURN in image.info:
-        said = image.info[TURN]
+        tag = image.info[TURN]
     else:
-        said = image.getexif().get(ORIENTATION)
-    return said if isinstance(said, int) and 1 <= said <= 8 else 1
+        tag = image.getexif().get(ORIENTATION)
+    return tag if isinstance(tag, int) and 1 <= tag <= 8 else 1
 
 
 def _find_chunk(file: IO[bytes], kind: bytes) -> bytes:

@@ -70,12 +70,12 @@ def _find_edges(
     rising = values.mean(1) * step[:, None]
     half = (rising[:, 0] + rising[:, -1]) / 2
     after = (rising > half[:, None]).argmax(1)
-    seen = np.flatnonzero(after > 0)
-    low, high = rising[seen, after[seen] - 1], rising[seen, after[seen]]
-    places = ACROSS[after[seen] - 1] + (half[seen] - low) / (high - low) * (ACROSS[1] - ACROSS[0])
-    middle = np.column_stack([line, row + 0.5] if axis == 0 else [row + 0.5, line])[seen]
-    rows = np.zeros((len(seen), 9))
-    rows[:, 3 * axis : 3 * axis + 3] = np.column_stack([np.ones(len(seen)), middle])
+    is_inside = np.flatnonzero(after > 0)
+    low, high = rising[is_inside, after[is_inside] - 1], rising[is_inside, after[is_inside]]
+    places = ACROSS[after[is_inside] - 1] + (half[is_inside] - low) / (high - low) * (ACROSS[1] - ACROSS[0])
+    middle = np.column_stack([line, row + 0.5] if axis == 0 else [row + 0.5, line])[is_inside]
+    rows = np.zeros((len(is_inside), 9))
+    rows[:, 3 * axis : 3 * axis + 3] = np.column_stack([np.ones(len(is_inside)), middle])
     rows[:, 6:8] = middle[:, axis, None] * middle
-    rows[:, 8] = step[seen]
-    return rows, places, np.isin(line[seen], (0, len(is_white)))
+    rows[:, 8] = step[is_inside]
+    return rows, places, np.isin(line[is_inside], (0, len(is_white)))

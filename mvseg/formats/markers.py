@@ -29,12 +29,12 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
     """
     dictionary = marker_dictionary(family)
     quads, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)
-    numbers, found = [] if ids is None else [int(number) for number in ids.ravel()], {}
+    numbers, markers = [] if ids is None else [int(number) for number in ids.ravel()], {}
     for number, quad in zip(numbers, quads, strict=True):
         if numbers.count(number) == 1:
             modules = dictionary.generateImageMarker(number, dictionary.markerSize + 2, borderBits=1)
-            found[number] = fit_grid(photo, np.asarray(quad, float).reshape(4, 2) + 0.5, modules > 0)
-    return found
+            markers[number] = fit_grid(photo, np.asarray(quad, float).reshape(4, 2) + 0.5, modules > 0)
+    return markers
 
 
 def find_scene_markers(photos: Photos) -> dict[Family, Seen]:
@@ -43,14 +43,14 @@ def find_scene_markers(photos: Photos) -> dict[Family, Seen]:
     Raises:
         InputError: a photo is missing or broken.
     """
-    found: dict[Family, Seen] = {family: {} for family in FAMILIES}
+    markers: dict[Family, Seen] = {family: {} for family in FAMILIES}
     for view in progress_bar(range(len(photos.scene.views)), name="markers", unit="photo"):
         photo = read_grey(photos, view)
-        for family, seen in found.items():
+        for family, seen in markers.items():
             for marker, quad in find_markers(photo, family).items():
                 for corner, px in enumerate(quad):
                     seen.setdefault((marker, corner), []).append((view, px))
-    return found
+    return markers
 
 
 def read_grey(photos: Photos, view: int) -> Grey:

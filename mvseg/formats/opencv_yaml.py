@@ -89,15 +89,15 @@ def read_calibration(folder: Path, file: str) -> Calibration:
     if not isinstance(entries, dict):
         raise InputError(f"{path}: is not a calibration, expected {EXPECTED}")
     entries = {str(key).lower().replace("_", ""): value for key, value in entries.items()}
-    found = {name: entries[key] for name, keys in NAMES.items() for key in reversed(keys) if key in entries}
+    calibration = {name: entries[key] for name, keys in NAMES.items() for key in reversed(keys) if key in entries}
     if isinstance(entries.get("imagesize"), list) and len(entries["imagesize"]) == 2:
-        found = dict(zip(("width", "height"), entries["imagesize"], strict=True)) | found
-    for name in {"matrix", "distortion"} & found.keys():
-        rows = found[name].get("data") if isinstance(found[name], dict) else found[name]
+        calibration = dict(zip(("width", "height"), entries["imagesize"], strict=True)) | calibration
+    for name in {"matrix", "distortion"} & calibration.keys():
+        rows = calibration[name].get("data") if isinstance(calibration[name], dict) else calibration[name]
         if isinstance(rows, list):  # nested or not
             rows = [x for row in rows for x in (row if isinstance(row, list) else [row])]
-        found[name] = rows
-    content = check_content(path, found, _Content, expected=EXPECTED)
+        calibration[name] = rows
+    content = check_content(path, calibration, _Content, expected=EXPECTED)
     K = np.array(content.matrix).reshape(3, 3)
     K[:2, 2] += 0.5
     model = str(entries.get("distortionmodel") or "plumb_bob")

@@ -118,12 +118,12 @@ def find_photo(folder: Path, file: str) -> str:
         if (folder / file).is_file():
             return file
         parent = (folder / file).parent
-        found = [path for path in _list_photos(parent, "*") if _is_named(path, name)]
-        if len(found) == 1:
-            return found[0].relative_to(folder).as_posix()
+        matches = [path for path in _list_photos(parent, "*") if _is_named(path, name)]
+        if len(matches) == 1:
+            return matches[0].relative_to(folder).as_posix()
     photos = [*_list_photos(folder, "*"), *_list_photos(folder / "images", "**/*")]
-    found = [path for path in photos if _is_named(path, name)]
-    return found[0].relative_to(folder).as_posix() if len(found) == 1 else file
+    matches = [path for path in photos if _is_named(path, name)]
+    return matches[0].relative_to(folder).as_posix() if len(matches) == 1 else file
 
 
 def size_of_photo(folder: Path, file: str) -> tuple[int, int]:

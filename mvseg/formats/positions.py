@@ -100,15 +100,15 @@ def _columns(rows: Rows) -> dict[str, Any]:
 
 def _by_photo(path: Path, rows: Rows, columns: Sequence[Any], *, what: str) -> dict[str, list[float]]:
     """{photo: numbers}, of the columns of the photo and of its numbers."""
-    found: dict[str, list[float]] = {}
+    positions: dict[str, list[float]] = {}
     for index, row in enumerate(rows):
         name = row.get(columns[0])
         if not isinstance(name, str) or not name:
             raise InputError(f"{path}: {what} {index} has no photo in '{columns[0]}'")
-        if name in found:
+        if name in positions:
             raise InputError(f"{path}: photo {name} has two {what}s, expected one")
-        found[name] = [_read_number(row.get(column), f"{path}: {column} of {name}") for column in columns[1:]]
-    return found
+        positions[name] = [_read_number(row.get(column), f"{path}: {column} of {name}") for column in columns[1:]]
+    return positions
 
 
 def _read_number(value: Any, where: str) -> float:

@@ -121,17 +121,17 @@ def _photo(folder: Path, frame: _Frame, given: dict[str, Any], *, undo: tuple[np
 
 def _complete(folder: Path, frame: _Frame, given: dict[str, Any]) -> dict[str, Any]:
     """The intrinsics, with the size of the photo and the focal length of the angle of view where they are missing."""
-    found = dict(given)
-    if "w" not in found or "h" not in found:
-        found = dict(zip(("w", "h"), size_of_photo(folder, frame.file_path), strict=True)) | given
-    if "fl_x" not in found and "camera_angle_x" in found:
-        fx = found["w"] / 2 / math.tan(found["camera_angle_x"] / 2)
-        fy = found["h"] / 2 / math.tan(found["camera_angle_y"] / 2) if "camera_angle_y" in found else fx
-        found = {"fl_y": fy, "cx": found["w"] / 2, "cy": found["h"] / 2} | found | {"fl_x": fx}
+    values = dict(given)
+    if "w" not in values or "h" not in values:
+        values = dict(zip(("w", "h"), size_of_photo(folder, frame.file_path), strict=True)) | given
+    if "fl_x" not in values and "camera_angle_x" in values:
+        fx = values["w"] / 2 / math.tan(values["camera_angle_x"] / 2)
+        fy = values["h"] / 2 / math.tan(values["camera_angle_y"] / 2) if "camera_angle_y" in values else fx
+        values = {"fl_y": fy, "cx": values["w"] / 2, "cy": values["h"] / 2} | values | {"fl_x": fx}
     for key in ("fl_x", "cx", "cy"):
-        if key not in found:
+        if key not in values:
             raise InputError(f"'{key}' is missing")
-    return found
+    return values
 
 
 def _lens(intrinsics: dict, K: np.ndarray) -> pycolmap.Camera | None:

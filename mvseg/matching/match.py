@@ -123,11 +123,11 @@ def match_masks(
         parts.append(part)
         rows.append(members)
     joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
-    kept = replace(masks, **{name: getattr(joined, name) for name in MATCHED})
+    filled = replace(masks, **{name: getattr(joined, name) for name in MATCHED})
     report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
     if any(part.report.method != report.method for part in parts):
         report = replace(report, method=config.resolved_method)
-    return Matching(kept, report)
+    return Matching(filled, report)
 
 
 def _factorise(regions: Regions, graph: ViewGraph, _: Clusters | None, *, config: MatchConfig) -> Clusters:

@@ -43,14 +43,14 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     def see(size: int) -> PassResult:
         return run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes)
 
-    found = choose_size(see, first)
+    best = choose_size(see, first)
     if few is opened:
-        return plant_of_pass(opened, _choose_pass(opened, found, detect))
+        return plant_of_pass(opened, _choose_pass(opened, best, detect))
     if boxes is not None:
         masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
-    sizes = [None if each is first else each.passes[0].longest for each in found]
+    sizes = [None if each is first else each.passes[0].longest for each in best]
     return plant_of_pass(opened, _run_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
 
 

@@ -63,7 +63,7 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
     shapes = opened.config.reconstruct
     surfaces = None if shapes is None or shapes.shape == "voxels" else fit_leaves(plant, same_segmenter)
     shown = surfaces or plant.instances.starts
-    left, fates = settle_edits(plant.edits, plant.refused, plant.rejected, shown, cameras=plant.scene.cameras)
+    rejected, fates = settle_edits(plant.edits, plant.refused, plant.rejected, shown, cameras=plant.scene.cameras)
     for fate in fates:
         if fate.finding is not None:
             warn(fate.finding)
@@ -72,7 +72,7 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         matching=plant.matching,
         instances=replace(plant.instances, surfaces=surfaces),
         photos=opened.photos,
-        rejected=left,
+        rejected=rejected,
         mask_kind=opened.mask_kind,
         num_moved=num_moved,
         views_left_out=opened.views_left_out,

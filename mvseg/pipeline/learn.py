@@ -77,11 +77,11 @@ def learn(
                 how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
                 report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
-            seen = _learn_once(best, labels, cache)
-            areas.append(seen.agreed_area)
-            if rounds is None and seen.agreed_area < GROWTH * best.agreed_area:
+            taught = _learn_once(best, labels, cache)
+            areas.append(taught.agreed_area)
+            if rounds is None and taught.agreed_area < GROWTH * best.agreed_area:
                 break
-            best = replace(seen, learned=replace(seen.learned, rounds=number))
+            best = replace(taught, learned=replace(taught.learned, rounds=number))
     except KeyboardInterrupt:
         warn(Finding("learning_interrupted", values={"count": len(areas) - 1}))
     except InputError as error:

@@ -116,11 +116,11 @@ def open_scene(
             require_photos(scene, folder)
             inputs |= _hash_weights(config)
             return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config, inputs=inputs)
-        found = recognise_masks(whole, masks)
-        regions = read_masks(whole, found, crowd=config.coco_crowd, categories=config.category_names)
+        mask_files = recognise_masks(whole, masks)
+        regions = read_masks(whole, mask_files, crowd=config.coco_crowd, categories=config.category_names)
         stems = None
         if config.stem_category is not None:
-            stems = read_masks(whole, found, crowd=config.coco_crowd, categories=[config.stem_category])
+            stems = read_masks(whole, mask_files, crowd=config.coco_crowd, categories=[config.stem_category])
         if before != {masks: _hash_masks(masks)}:
             raise InputError(f"{masks}: has changed while it was read, expected masks that are complete")
         if left_out:
@@ -133,7 +133,8 @@ def open_scene(
             stems = stems.of_views(taken) if left_out else stems
             both = Masks.concatenate((given, Masks.of(stems, classes=torch.full((len(stems),), STEM_CLASS))))
             given = both.select(both.view_index.argsort(stable=True))
-        return Opened(scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config, inputs=inputs)
+        return Opened(scene, photos, given, mask_kind=mask_files.kind, views_left_out=left_out, config=config,
+        inputs=inputs)
 
 
 def _hash_masks(masks: Path) -> str:

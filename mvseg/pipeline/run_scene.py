@@ -60,7 +60,7 @@ def run_scene(
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
             check_made_for(corrections, opened.photos)
-        with note_warnings() as said:
+        with note_warnings() as findings_before:
             if opened.given is not None:
                 plant = match_given(opened)
             else:
@@ -78,7 +78,7 @@ def run_scene(
         result = shape_leaves(edited, same_segmenter=before)
         result = check_result(result, edited)
         result = measure(result, config)
-        packed = pack_plant(plant, said)
+        packed = pack_plant(plant, findings_before)
     inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
     findings = keep_causes((*noticed, *result.findings))
     result = replace(result, findings=findings, corrections=corrections, before_edits=packed)

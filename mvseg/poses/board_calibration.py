@@ -63,17 +63,17 @@ def calibrate_turntable(
             do, or photos that no rotation about one axis explains.
     """
     num_angles = len(next(iter(photos.values())))
-    seen = {}
+    boards = {}
     for name, each in photos.items():
         where = f"camera {name}: " if len(photos) > 1 else ""
         if len(each) != num_angles:
             first = next(iter(photos))
             message = f"{len(each)} photos, {num_angles} of camera {first}"
             raise InputError(f"{where}{message}, expected as many, at the same angles in the same order")
-        seen[name] = _find_boards(each, board, where)
+        boards[name] = _find_boards(each, board, where)
     is_given = lens is not None
     starts = [dict.fromkeys(photos, lens)] if lens else [_middling_lenses(photos, focal) for focal in TABLE.starts]
-    start_fit = partial(_fit, seen, board, noise_px=TABLE.noise_px, fix_lenses=is_given, tolerance=TABLE.rough)
+    start_fit = partial(_fit, boards, board, noise_px=TABLE.noise_px, fix_lenses=is_given, tolerance=TABLE.rough)
     fits = [start_fit(start)[1] for start in starts]
     rough = min(fits, key=lambda fit: fit.cost)  # from a wrong focal length, side minima are possible
     if rough.residual_px > TABLE.most_residual * max(each.size[0] for each in rough.cameras):
@@ -81,7 +81,7 @@ def calibrate_turntable(
         raise InputError(f"{message}: did a camera move, or the board on the table?")
     lenses = dict(zip(photos, rough.cameras, strict=True))
     noise_px = max(TABLE.least_noise_px, float(np.sqrt((rough.residuals**2).mean())))
-    used, fit = _fit(seen, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=TABLE.fine)
+    used, fit = _fit(boards, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=TABLE.fine)
     angles = np.full(num_angles, np.nan)
     angles[used] = fit.angles
     return TurntableCalibration(
@@ -100,11 +100,12 @@ def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> Seen
             given = f"{photo.shape[1]} x {photo.shape[0]} pixels, the first {size[0]} x {size[1]}"
             raise InputError(f"{where}photo {index} has {given}, expected one camera")
     seen = {index: find_board(photo, board) for index, photo in enumerate(photos)}
-    found = {index: each for index, each in seen.items() if len(each[0]) >= TABLE.least_corners}
-    if len(found) < TABLE.least_photos:
-        message = f"{where}{len(found)} of {len(photos)} photos show {TABLE.least_corners} corners of the board or more"
-        raise InputError(f"{message}, expected at least {TABLE.least_photos}: is it {board.columns} x {board.rows}?")
-    return found
+    boards = {index: each for index, each in seen.items() if len(each[0]) >= TABLE.least_corners}
+    if len(boards) < TABLE.least_photos:
+        shown = f"{len(boards)} of {len(photos)} photos show {TABLE.least_corners} corners of the board or more"
+        squares = f"{board.columns} x {board.rows}"
+        raise InputError(f"{where}{shown}, expected at least {TABLE.least_photos}: is it {squares}?")
+    return boards
 
 
 def _middling_lenses(photos: Mapping[str, Sequence[Grey]], focal: float) -> dict[str, TableCamera]:
@@ -129,16 +130,16 @@ def _fit(
 ) -> tuple[list[int], TableFit]:
     """The table as these cameras see it, from lenses that are nearly right: places of the angles at which the board is
     seen, and what explains it best; its cameras are in the order of `sightings`."""
-    poses = {name: {angle: _board_pose(*each, board, lenses[name]) for angle, each in found.items()}
-             for name, found in sightings.items()}  # fmt: skip
+    poses = {name: {angle: _board_pose(*each, board, lenses[name]) for angle, each in corners_of.items()}
+             for name, corners_of in sightings.items()}  # fmt: skip
     numbers = [each for photos in sightings.values() for each, _ in photos.values()]
     corners = np.concatenate([board.corners()[each] for each in numbers])
     cameras, angles, world_from_board = _initialise(lenses, poses, middle=corners.mean(0))
     used = sorted(angles)
     rows = [
         (np.full(len(px), index), np.full(len(px), used.index(angle)), board.corners()[numbers], px)
-        for index, found in enumerate(sightings.values())
-        for angle, (numbers, px) in found.items()
+        for index, corners_of in enumerate(sightings.values())
+        for angle, (numbers, px) in corners_of.items()
     ]
     camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
     fit = fit_table(
@@ -169,18 +170,18 @@ def _initialise(
     """
     first = max(poses, key=lambda name: len(poses[name]))
     cam_from_world, angles, world_from_board = _initial_world(poses[first], middle)
-    found = {first: cam_from_world}
-    while len(found) < len(poses):
-        name = max(poses.keys() - found.keys(), key=lambda name: (len(poses[name].keys() & angles.keys()), name))
+    photos = {first: cam_from_world}
+    while len(photos) < len(poses):
+        name = max(poses.keys() - photos.keys(), key=lambda name: (len(poses[name].keys() & angles.keys()), name))
         common = sorted(poses[name].keys() & angles.keys())
         if not common:
             raise InputError(f"camera {name}: it sees the board at no angle at which another camera does")
-        found[name] = poses[name][common[0]] * (_turn_z(angles[common[0]]) * world_from_board).inverse()
+        photos[name] = poses[name][common[0]] * (_turn_z(angles[common[0]]) * world_from_board).inverse()
         for place, pose in poses[name].items():
-            turned = found[name].inverse() * pose * world_from_board.inverse()
+            turned = photos[name].inverse() * pose * world_from_board.inverse()
             angles.setdefault(place, float(np.degrees(_rotation(turned).as_rotvec()[2])))
     zero = angles[min(angles)]
-    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in found.items()}
+    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in photos.items()}
     cameras = {
         name: replace(lens, R=at_zero[name].rotation.matrix(), t=at_zero[name].translation)
         for name, lens in lenses.items()

@@ -49,7 +49,7 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
     determined.
     """
     covariance = None if is_given else _covariance(model)
-    noise_px, found = _noise_px(model), []
+    noise_px, lengths = _noise_px(model), []
     for _, camera in sorted(model.cameras.items()):
         focal, *_ = camera.focal_length_idxs()
         px, deviation = float(camera.params[focal]), None
@@ -58,8 +58,8 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
         if covariance is not None:
             of_lens = covariance.get_other_params_cov(camera.params)
             deviation = px if of_lens is None else _deviation(camera, noise_px**2 * of_lens, focal)
-        found.append(FocalLength(px, deviation))
-    return found
+        lengths.append(FocalLength(px, deviation))
+    return lengths
 
 
 def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
@@ -77,11 +77,11 @@ def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
         own.update_point_3d_errors()
         covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), own, adjuster)
     cameras = [own.cameras[number] for number in sorted(own.cameras)]
-    found = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
-    if any(each is None for each in found):
+    zooms = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
+    if any(each is None for each in zooms):
         return None
     lengths = np.array([each.params[0] for each in cameras])
-    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in found if each is not None])
+    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in zooms if each is not None])
     groups: dict[int, list[int]] = {}
     for place, number in enumerate(sorted(own.cameras)):
         groups.setdefault(model.images[number].camera_id, []).append(place)

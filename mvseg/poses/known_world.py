@@ -83,12 +83,12 @@ def place(scene: Scene, world: Known) -> Placement:
 
 
 def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:
-    seen: dict[int, list[tuple[int, Floats]]] = {}
+    corners: dict[int, list[tuple[int, Floats]]] = {}
     photos = Photos(scene)
     for view in progress_bar(range(len(scene.views)), name="board", unit="photo"):
         for number, px in zip(*find_board(read_grey(photos, view), board), strict=True):
-            seen.setdefault(int(number), []).append((view, px))
-    points = triangulate_points(scene.cameras, seen)
+            corners.setdefault(int(number), []).append((view, px))
+    points = triangulate_points(scene.cameras, corners)
     try:
         alignment = align(np.array(list(points.values())).reshape(-1, 3), board.corners()[list(points)])
     except InputError as error:
@@ -177,7 +177,7 @@ def _view(scene: Scene, photo: str) -> int:
 
 def _spot(scene: Scene, name: str, places: list[tuple[str, Floats]]) -> Floats:
     """The point that is at these pixels (2,) of the photos as they are, with lens distortion."""
-    seen = []
+    sightings = []
     for photo, px in places:
         view = _view(scene, photo)
         lens, camera = scene.views[view].lens, scene.cameras[[view]]
@@ -185,8 +185,8 @@ def _spot(scene: Scene, name: str, places: list[tuple[str, Floats]]) -> Floats:
         if px[0] > width or px[1] > height:
             raise InputError(f"--distance: {photo}:{px[0]:g},{px[1]:g} is outside of its {width} x {height} pixels")
         K = camera.K[0].cpu().numpy()
-        seen.append((view, px if lens is None else pinhole_from_photo(lens, K, px[None])[0]))
-    points = triangulate_points(scene.cameras, {name: seen})
+        sightings.append((view, px if lens is None else pinhole_from_photo(lens, K, px[None])[0]))
+    points = triangulate_points(scene.cameras, {name: sightings})
     if not points:
         wanted = "the same spot in two photos or more, right to 0.3 % of their width, seen from places that differ"
         raise InputError(f"--distance: {name} is not one point, expected {wanted}")

@@ -36,16 +36,16 @@ def choose_pairs(
     sequences: dict[str, list[int]] = defaultdict(list)
     for index, name in enumerate(names):
         sequences[name.rpartition("/")[0]].append(index)
-    found: set[Pair] = set()
+    chosen_pairs: set[Pair] = set()
     for one in sequences.values():
         for other in sequences.values():
             for place, index in enumerate(one):
                 same = round(place * len(other) / len(one))  # the place of this photo in the other sequence
                 near = {other[(same + step) % len(other)] for step in _steps(len(other))}
-                found |= {(min(index, each), max(index, each)) for each in near if each != index}
+                chosen_pairs |= {(min(index, each), max(index, each)) for each in near if each != index}
     if pairs is None and alike is not None:
-        found |= _most_alike(alike, found)
-    return sorted(found)
+        chosen_pairs |= _most_alike(alike, chosen_pairs)
+    return sorted(chosen_pairs)
 
 
 def pairs_with(some: Iterable[int], num_photos: int) -> list[Pair]:
@@ -63,12 +63,12 @@ def _steps(num_photos: int) -> list[int]:
 
 def _most_alike(alike: NDArray[np.int64], chosen: set[Pair]) -> set[Pair]:
     """The photos that are most alike for each photo, not counting known pairs."""
-    left = alike.copy()
+    rest = alike.copy()
     for i, j in chosen:
-        left[i, j] = left[j, i] = 0
-    found = set()
-    for i, row in enumerate(left):
+        rest[i, j] = rest[j, i] = 0
+    pairs = set()
+    for i, row in enumerate(rest):
         for j in np.argsort(-row, kind="stable")[: STRUCTURE.most_alike]:
             if row[j] >= STRUCTURE.least_alike and i != j:
-                found.add((min(i, int(j)), max(i, int(j))))
-    return found
+                pairs.add((min(i, int(j)), max(i, int(j))))
+    return pairs

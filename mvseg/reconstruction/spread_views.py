@@ -54,13 +54,13 @@ def _directions(cameras: Cameras) -> NDArray[np.float64]:
 
 def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
     """(V,) bool: the views that are left when the most crowded one goes, again and again."""
-    kept = np.ones(len(crowding), bool)
+    chosen = np.ones(len(crowding), bool)
     load = crowding.sum(1)
-    while kept.sum() > most:
-        goes = _first_least(np.where(kept, -load, np.inf))
-        kept[goes] = False
+    while chosen.sum() > most:
+        goes = _first_least(np.where(chosen, -load, np.inf))
+        chosen[goes] = False
         load -= crowding[goes]
-    return kept
+    return chosen
 
 
 def _exchange(crowding: NDArray[np.float64], is_taken: NDArray[np.bool_]) -> NDArray[np.bool_]:

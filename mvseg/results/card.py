@@ -48,14 +48,14 @@ def make_card(result: Result, out: Path) -> Card:
 
 def _say_found(result: Result) -> str:
     num_photos, num_leaves = len(result.scene.views), result.matching.num_instances
-    found = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
+    parts = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
     if result.traits is not None and (counted := int(result.traits.whole["number_of_leaves"].value)) != num_leaves:
-        found += f", {counted} of which count in the plant's traits"
+        parts += f", {counted} of which count in the plant's traits"
     if result.learned.rounds:
-        found += f", seen by a detector that learned this plant in {_count(result.learned.rounds, 'round', 'rounds')}"
+        parts += f", seen by a detector that learned this plant in {_count(result.learned.rounds, 'round', 'rounds')}"
     if result.traits is not None and (area := result.traits.whole["total_leaf_area"]).exists and num_leaves:
-        found += f"; total area {_say_number(area.value, area.sd)} {result.traits.unit or 'world unit'}^2"
-    return found
+        parts += f"; total area {_say_number(area.value, area.sd)} {result.traits.unit or 'world unit'}^2"
+    return parts
 
 
 def _gravest(result: Result) -> Finding | None:

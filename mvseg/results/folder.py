@@ -62,8 +62,8 @@ def save_result(
     """
     if run is None:
         run = {} if result.run is None else result.run.as_json()
-    said = {**run, **describe_result(result)}
-    with replace_result(out, said, output) as folder:
+    record = {**run, **describe_result(result)}
+    with replace_result(out, record, output) as folder:
         pictures = _write_images(result, folder)
         _write_instances(result, folder)
         if result.surfaces is not None or result.voxels is not None:
@@ -77,7 +77,7 @@ def save_result(
         if report:
             from mvseg.results.report.page import write_report  # loads trimesh
 
-            write_report(folder / REPORT_FILE, result, pictures, run=said)
+            write_report(folder / REPORT_FILE, result, pictures, run=record)
 
 
 def describe_result(result: Result) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def describe_result(result: Result) -> dict[str, Any]:
     report, scene = result.matching.report, result.scene
     shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]
     taken = [view.name for view in scene.views]
-    said: dict[str, Any] = {
+    record: dict[str, Any] = {
         "format": FORMAT,
         "scene": scene.name,
         "unit": scene.unit or None,
@@ -103,17 +103,17 @@ def describe_result(result: Result) -> dict[str, Any]:
         },
     }
     if (traits := result.traits) is not None:
-        said["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
+        record["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
     if (learned := result.learned).agreed_area:
-        said["learned"] = {"rounds": learned.rounds, "agreed_area": learned.agreed_area}
+        record["learned"] = {"rounds": learned.rounds, "agreed_area": learned.agreed_area}
     if result.corrections is not None and result.corrections.edits:
-        said["edits"] = dump_edits(result.corrections.edits)
+        record["edits"] = dump_edits(result.corrections.edits)
     if result.fates:
-        said["corrections"] = [asdict(each) for each in result.fates]
-    said["counts"] = {"regions": len(result.regions), "instances": result.matching.num_instances}
+        record["corrections"] = [asdict(each) for each in result.fates]
+    record["counts"] = {"regions": len(result.regions), "instances": result.matching.num_instances}
     if result.num_moved is not None:
-        said["counts"]["moved"] = result.num_moved
-    return said | {"seconds": {stage: round(wall, 3) for stage, wall in result.seconds.items()}}
+        record["counts"]["moved"] = result.num_moved
+    return record | {"seconds": {stage: round(wall, 3) for stage, wall in result.seconds.items()}}
 
 
 def _or_none(number: float) -> float | None:

@@ -92,12 +92,12 @@ def describe_world(scene: Scene) -> dict[str, Any]:
 def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
     """{name of a leaf's node: its extras}: id, unit, method, quality, and its existing numbers with standard
     deviations."""
-    found: dict[str, dict[str, Any]] = {}
+    extras: dict[str, dict[str, Any]] = {}
     if traits is None:
-        return found
+        return extras
     for leaf in traits.leaves:
         numbers = {name: number for name, number in leaf.numbers.items() if number.exists}
-        found[f"leaf_{leaf.leaf:03d}"] = {
+        extras[f"leaf_{leaf.leaf:03d}"] = {
             "leaf": leaf.leaf,
             "unit": traits.unit or None,
             "method": leaf.method,
@@ -106,7 +106,7 @@ def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
             "traits": {name: _rounded(number.value) for name, number in numbers.items()},
             "sd": {name: _rounded(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
         }
-    return found
+    return extras
 
 
 def _rounded(value: float) -> float:

@@ -67,13 +67,13 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
             int(leaf): LeafSurface(
                 coefficients=torch.from_numpy(numbers.copy()),
                 covariance=torch.from_numpy(products.copy()),
-                views=torch.from_numpy(seen.copy()),
+                views=torch.from_numpy(in_views.copy()),
                 residual_px=torch.from_numpy(residual.copy()),
                 iou=torch.from_numpy(iou.copy()),
                 is_oriented=bool(is_oriented),
                 quality=Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True))),
             )
-            for leaf, is_oriented, numbers, products, seen, residual, iou, doubts, codes in zip(*rows, strict=True)
+            for leaf, is_oriented, numbers, products, in_views, residual, iou, doubts, codes in zip(*rows, strict=True)
         }
         for leaf, each in surfaces.items():
             if not each.exists and (each.coefficients.isfinite().any() or not each.quality.reasons):

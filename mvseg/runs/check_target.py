@@ -165,17 +165,17 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
 
 def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
     """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
-    seen: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
+    sightings: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
     scene, on_page = photos.scene, tag_corners()
     for view in progress_bar(range(len(scene.views)), name="tags", unit="photo"):
         for number, quad in find_markers(read_grey(photos, view), FAMILY).items():
             for corner in range(4 if number in on_page else 0):
-                seen.setdefault((number, corner), []).append((view, quad[corner]))
-    corners = triangulate_points(scene.cameras, seen)
+                sightings.setdefault((number, corner), []).append((view, quad[corner]))
+    corners = triangulate_points(scene.cameras, sightings)
     if not corners:
         found = "no tag of the page is found in the photos"
-        if seen:
-            found = f"{len({number for number, _ in seen})} tags are found, but the cameras agree on none of them"
+        if sightings:
+            found = f"{len({number for number, _ in sightings})} tags are found, but the cameras agree on none of them"
         raise InputError(f"{scene.source}: {found}, expected photos of the page that mvseg target writes")
     return corners
 

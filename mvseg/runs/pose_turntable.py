@@ -70,19 +70,19 @@ def pose_board_photos(
             grey.setdefault(camera, []).append(photo)
         with faults_of(calibration):
             lens = None if given is None else _given_lens(given, files)
-        found = calibrate_turntable(grey, board, lens=lens)
+        fit = calibrate_turntable(grey, board, lens=lens)
         views = []
         for camera, each in by_camera.items():
-            for file, angle in zip(each, found.angles.tolist(), strict=True):
+            for file, angle in zip(each, fit.angles.tolist(), strict=True):
                 if np.isfinite(angle):
                     views.append((f"{IMAGES}/{file.name}", camera, round(angle, 6)))
                 else:
                     (folder / IMAGES / file.name).unlink()
-        cameras = {name: _describe_camera(found.cameras[name]) for name in by_camera}
+        cameras = {name: _describe_camera(fit.cameras[name]) for name in by_camera}
         write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
-        run |= {"residual_px": round(found.residual_px, 4), "corners": found.num_corners, "photos": len(files)}
-        lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in found.cameras.items()}
+        run |= {"residual_px": round(fit.residual_px, 4), "corners": fit.num_corners, "photos": len(files)}
+        lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in fit.cameras.items()}
         run["lenses"] = [{"camera": name, "focal_length": asdict(length)} for name, length in lengths.items()]
         doubts = [
             each for name, length in lengths.items() for each in length.doubts("turntable_focal_length_unsure", name)
@@ -93,7 +93,7 @@ def pose_board_photos(
         warn(finding)
     if now_running().progress:
         share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
-        say(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
+        say(f"{out}: {share}, {fit.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
         for name, length in lengths.items():
             say(f"  {name}: {length.describe()}")
         say(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
@@ -162,11 +162,11 @@ def _angles_of(
     """The angle of each photo, degrees."""
     if isinstance(angles, Path):
         listed = read_photo_angles(angles)
-        found = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]
-        for name, angle in zip(names, found, strict=True):
+        listed_angles = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]
+        for name, angle in zip(names, listed_angles, strict=True):
             if angle is None:
                 raise InputError(f"{angles}: there is no angle of photo {name}")
-        return [angle for angle in found if angle is not None]
+        return [angle for angle in listed_angles if angle is not None]
     places = [camera_of[:index].count(camera) for index, camera in enumerate(camera_of)]
     if angles is not None:
         return [angles * place for place in places]

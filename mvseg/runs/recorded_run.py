@@ -34,7 +34,7 @@ class RecordedRun:
 
     Attributes:
         folder: of the result.
-        said: all that its run.json says.
+        record: all that its run.json says.
         config: the options of its stages.
         scene: folder of the scene.
         masks: that were given; None: a detector found them.
@@ -43,7 +43,7 @@ class RecordedRun:
     """
 
     folder: Path
-    said: RunRecord
+    record: RunRecord
     config: RunConfig
     scene: Path
     masks: Path | None
@@ -59,9 +59,9 @@ def read_recorded(folder: Path) -> RecordedRun:
         InputError: this is no result, or one with options that this version does not have; its scene or its masks are
             gone.
     """
-    said = load_run(folder)
+    record = load_run(folder)
     scene, masks, corrections = (
-        None if (stated := said.config.get(name)) is None else find_place(folder, said, Path(str(stated)))
+        None if (stated := record.config.get(name)) is None else find_place(folder, record, Path(str(stated)))
         for name in ("scene", "masks", "corrections")
     )
     if scene is None:
@@ -72,12 +72,12 @@ def read_recorded(folder: Path) -> RecordedRun:
         raise InputError(f"{masks}: the masks of this result are gone, expected them there")
     return RecordedRun(
         folder=folder,
-        said=said,
-        config=_read_config(folder, said),
+        record=record,
+        config=_read_config(folder, record),
         scene=scene,
         masks=masks,
         corrections=corrections,
-        changes=tuple(_list_changes(folder, said)),
+        changes=tuple(_list_changes(folder, record)),
     )
 
 
@@ -153,11 +153,11 @@ def _read_config(folder: Path, record: RunRecord) -> RunConfig:
         for stage, value in record.config.items()
         if stage not in (*PLACES, *GONE, "from_here")
     }
-    known = asdict(RunConfig())
-    unknown = [name for name in options if name not in known]
+    defaults = asdict(RunConfig())
+    unknown = [name for name in options if name not in defaults]
     for stage, inside in options.items():
-        if isinstance(inside, dict) and isinstance(known.get(stage), dict):
-            unknown += [f"{stage}.{name}" for name in inside if name not in known[stage]]
+        if isinstance(inside, dict) and isinstance(defaults.get(stage), dict):
+            unknown += [f"{stage}.{name}" for name in inside if name not in defaults[stage]]
     try:
         if unknown:
             raise InputError(f"unknown option {unknown[0]}")

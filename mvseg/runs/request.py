@@ -74,7 +74,7 @@ def repeat_run(
     run = read_recorded(folder)
     for change in run.changes:
         say(f"mvseg: {change}", to_stderr=True)
-    learned = load_learned(folder, run.said)
+    learned = load_learned(folder, run.record)
     if detector is not None:
         learned = replace(learned, weights=detector.read_bytes(), rounds=1)
     edits = corrections or run.corrections

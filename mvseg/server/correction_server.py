@@ -27,13 +27,13 @@ LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # chosen: that learning takes on
 
 def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:
     """Run `mvseg` in a process of its own: its exit code, and the last line that it told."""
-    command, said = [sys.executable, "-m", "mvseg.cli", *words], ""
+    command, last_line = [sys.executable, "-m", "mvseg.cli", *words], ""
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         for line in process.stderr or ():
             if line.strip():
-                said = line.strip()
-                tell(said)
-    return process.returncode, said
+                last_line = line.strip()
+                tell(last_line)
+    return process.returncode, last_line
 
 
 class OpenFolder(Protocol):
@@ -290,7 +290,7 @@ class Corrector(Generic[Kind]):
                 if self.edits.is_changed():
                     break
                 self.news.wait(LOOK_SECONDS)
-            task, shown = self.task, self.shown
+            task, page = self.task, self.shown
             computing = task.then if isinstance(task, Learning) else task
             return {
                 "number": self.number,
@@ -298,9 +298,9 @@ class Corrector(Generic[Kind]):
                 "isComputing": isinstance(computing, Computing),
                 "doing": task.doing if isinstance(task, Computing) else "",
                 "isChanged": self.edits.is_changed(),
-                "problem": shown.problem,
-                "outcomes": shown.update.outcomes,
-                "update": shown.update.news if shown.number > after else None,
+                "problem": page.problem,
+                "outcomes": page.update.outcomes,
+                "update": page.update.news if page.number > after else None,
                 "learning": self._describe_learning(task.doing if isinstance(task, Learning) else ""),
                 "making": self.making or "",
             }
@@ -375,11 +375,11 @@ class Corrector(Generic[Kind]):
         try:
             with TemporaryDirectory() as place:
                 words = [*self.opened.again(Path(place)), "--corrections", str(self.edits.path.resolve())]
-                returncode, said = run_command(words, self._tell_making)
+                returncode, sentence = run_command(words, self._tell_making)
             with self.news:
                 self.edits.write_again()
             if returncode:
-                raise InputError(said or "the run was stopped")
+                raise InputError(sentence or "the run was stopped")
             opened = self.opened.reopened()
             with self.news:
                 self.opened, self.shown = opened, replace(self.shown, update=replace(self.shown.update, news=None))

@@ -132,26 +132,26 @@ class OpenResult:
         """The page with the newest result, and with all edits."""
         shown, pictures = self._shown
         shown = replace(shown, corrections=corrections)
-        return build_page(shown, pictures, run=self.run.said.as_json(), is_served=True)
+        return build_page(shown, pictures, run=self.run.record.as_json(), is_served=True)
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         """Compute the consequences of edits, see `recompute`."""
-        shown, outcomes, messages = self.recompute(corrections, is_old)
+        result, outcomes, messages = self.recompute(corrections, is_old)
         made_with = () if self._saved.corrections is None else self._saved.corrections.edits
         if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
-            shown = replace(shown, instances=replace(shown.instances, traits=self._saved.traits))
-        sizes = shown.scene.cameras.sizes.tolist()
+            result = replace(result, instances=replace(result.instances, traits=self._saved.traits))
+        sizes = result.scene.cameras.sizes.tolist()
         pictures = [
-            picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
+            picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
             for view, picture in enumerate(self._shown[1])
         ]
         before = self._shown[0]
         known = () if before.corrections is None else before.corrections.edits
         new = [each for each in corrections.edits if each not in known]
-        vanished = tell_vanished(before, shown, new=new)
-        news = describe_update(shown, pictures)
-        news["told"] = tell_drawn(shown, new=new, angles=measure_angles(shown))
-        self._shown = shown, pictures
+        vanished = tell_vanished(before, result, new=new)
+        news = describe_update(result, pictures)
+        news["told"] = tell_drawn(result, new=new, angles=measure_angles(result))
+        self._shown = result, pictures
         yield Update(news, outcomes, vanished + messages)
         if self.opened.is_chosen:
             self._now[0].draw_ahead()
@@ -201,7 +201,7 @@ class OpenResult:
             edited = apply_edits(plant, corrections)
             result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers, self._shown[0].masks)
-        told = {"edit", *(each.get("code") for each in self.run.said.findings)}
+        told = {"edit", *(each.get("code") for each in self.run.record.findings)}
         new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]
 
@@ -218,11 +218,11 @@ class OpenResult:
         """
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
-        with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
+        with running(is_cancelled=is_old, report=report), collect_warnings() as findings, TemporaryDirectory() as place:
             learned = learn(self._found[0], cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
         if learned.learned.weights is None:
-            raise InputError(" ".join(map(as_sentence, said)))
-        self.learned = learned, said
+            raise InputError(" ".join(map(as_sentence, findings)))
+        self.learned = learned, findings
 
     def unlearn(self) -> None:
         """Go back to the detector before it learned."""
@@ -291,7 +291,7 @@ class OpenResult:
 
     def _before_edits(self) -> bytes | None:
         """What the run knew before edits; None where it said nothing, or where something has changed since."""
-        path, said = self.folder / BEFORE_EDITS_FILE, self.run.said
+        path, said = self.folder / BEFORE_EDITS_FILE, self.run.record
         is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
         return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None
 

@@ -84,15 +84,15 @@ class OpenTracks:
             InputError: see `track_leaves`.
         """
         links, outcomes = self._links(corrections)
-        self._shown = shown = self._track(links)
-        yield Update(_without_pictures(shown.data), outcomes, [])
+        self._shown = page = self._track(links)
+        yield Update(_without_pictures(page.data), outcomes, [])
         questions = []
-        for question in list_questions(shown.tracks, links):
+        for question in list_questions(page.tracks, links):
             if is_old():
                 raise Cancelled
             questions.append(_describe_question(question) | {"changes": self._changes(question, links)})
-        shown.data["questions"] = questions
-        yield Update(_without_pictures(shown.data), outcomes, [])
+        page.data["questions"] = questions
+        yield Update(_without_pictures(page.data), outcomes, [])
 
     def again(self, _: Path) -> list[str]:
         """`mvseg track --again`: the tables of all plants."""
@@ -125,11 +125,11 @@ class OpenTracks:
 
 
 def _choose_plant(recorded: RecordedTracks, name: str | None) -> PlantResults:
-    found = [each for each in recorded.plants if name in (None, each.plant)]
-    if len(found) == 1:
-        return found[0]
+    plants = [each for each in recorded.plants if name in (None, each.plant)]
+    if len(plants) == 1:
+        return plants[0]
     names = list_some([each.plant for each in recorded.plants])
-    what = f"holds {len(found)} plants" if name is None else f"holds no plant {name}"
+    what = f"holds {len(plants)} plants" if name is None else f"holds no plant {name}"
     raise InputError(f"{recorded.folder}: {what}, expected one of {names} with --plant")
 
 

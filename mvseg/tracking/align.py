@@ -115,14 +115,14 @@ def list_poses(pair: Pair) -> Poses:
     looked_at = np.concatenate([np.eye(4)[None], *asked])
     poses = np.concatenate([looked_at, draw_poses(pair)])
     rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
-    found: list[Alignment] = [_as_it_stood(pair)]
+    refined: list[Alignment] = [_as_it_stood(pair)]
     left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
-    while len(left) and len(found) < ALIGN.num_refined:
-        found.append(refine_alignment(pair, poses[left[0]]))
+    while len(left) and len(refined) < ALIGN.num_refined:
+        refined.append(refine_alignment(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
-    every = np.stack([each.pose for each in found])
-    gains = np.array([each.gain - large_new(pair, each.pairs) for each in found])
-    return Poses(pair, tuple(found), gains, near_world(pair, every))
+    every = np.stack([each.pose for each in refined])
+    gains = np.array([each.gain - large_new(pair, each.pairs) for each in refined])
+    return Poses(pair, tuple(refined), gains, near_world(pair, every))
 
 
 def judge(poses: Poses, habit: Habit) -> Alignment:
@@ -223,15 +223,15 @@ def make_poses(rotations: Floats, shifts: Floats) -> Floats:
 def alikeness(pair: Pair, poses: Floats) -> Floats:
     """(H, N + M) in [0, 1] how alike the most alike leaf of the other date is under each of the poses (H, 4, 4)."""
     first, second = pair.first, pair.second
-    found = []
+    likeness = []
     for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
         bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
         chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
         away = np.square(bases[:, :, None] - second.bases).sum(-1) / (POSES.across * pair.scale) ** 2
         turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / POSES.turn**2
         alike = np.exp(-0.25 * (away + turn))
-        found.append(np.concatenate([alike.max(2), alike.max(1)], 1))
-    return np.concatenate(found)
+        likeness.append(np.concatenate([alike.max(2), alike.max(1)], 1))
+    return np.concatenate(likeness)
 
 
 def refine_alignment(pair: Pair, pose: Floats) -> Alignment:

@@ -81,25 +81,25 @@ def link_leaves(
 def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[Association]:
     """The links with probabilities summed over poses: that each is right under the one that was taken, and under the
     others. What the user says is so under all of them."""
-    found = []
+    associations = []
     for link in links:
         (earlier, row), (later, column) = link.before, link.after
         sure, others = float(compared.trust[earlier, later]), compared.otherwise.get((earlier, later))
         chance = sure * link.probability + (1 - sure) * (0.0 if others is None else float(others[row, column]))
-        found.append(link if link.is_asked else replace(link, probability=chance))
-    return found
+        associations.append(link if link.is_asked else replace(link, probability=chance))
+    return associations
 
 
 def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     """{(earlier, later): (N, M) probability that leaves of these two dates are the same, summed over poses}, whatever
     other dates and what the user say; for asking about those that are not linked."""
-    found = {}
+    chances = {}
     for pair, costs in compared.costs.items():
         odds = np.exp(np.clip(LINKING.unlinked - costs, -LINKING.most_odds, LINKING.most_odds))
         under_this = odds / (1 + odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds)
         trust = compared.trust[pair]
-        found[pair] = trust * under_this + (1 - trust) * compared.otherwise.get(pair, 0.0)
-    return found
+        chances[pair] = trust * under_this + (1 - trust) * compared.otherwise.get(pair, 0.0)
+    return chances
 
 
 def join_sights(gains: Floats, date_of: np.ndarray) -> np.ndarray:
@@ -150,10 +150,10 @@ def _probabilities(tracks: np.ndarray, gains: Floats, later: np.ndarray) -> dict
     (`CALIBRATION`).
     """
     here, there, table = _part_gains(tracks, gains, ~later, later)
-    odds, found = np.exp(np.clip(table, -LINKING.most_odds, LINKING.most_odds)), {}
+    odds, probabilities = np.exp(np.clip(table, -LINKING.most_odds, LINKING.most_odds)), {}
     for track in np.intersect1d(here, there).tolist():
         row, column = np.searchsorted(here, track), np.searchsorted(there, track)
         others = odds[row].sum() + odds[:, column].sum() - 2 * odds[row, column]
         logit = CALIBRATION[0] * (np.log(odds[row, column]) - np.log1p(others)) + CALIBRATION[1]
-        found[track] = float(expit(logit))
-    return found
+        probabilities[track] = float(expit(logit))
+    return probabilities

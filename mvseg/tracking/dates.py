@@ -146,13 +146,13 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     for leaf in traits.leaves:
         if leaf.rejection is None or leaf.rejection == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
-            seen = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
+            observation = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
             if leaf.leaf in nodes:
                 stem, node = nodes[leaf.leaf]
                 measured = {"internode": (node.internode, traits.unit), "divergence": (node.divergence, "degree")}
                 numbers = {name: Number(m.value, m.sd, unit) for name, (m, unit) in measured.items() if m.exists}
-                seen = replace(seen, numbers={**seen.numbers, **numbers}, node=(stem, node.number))
-            leaves.append(replace(seen, is_doubted=leaf.rejection is not None))
+                observation = replace(observation, numbers={**observation.numbers, **numbers}, node=(stem, node.number))
+            leaves.append(replace(observation, is_doubted=leaf.rejection is not None))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
         knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole),

@@ -111,7 +111,7 @@ def measure_growth(tracks: Tracks) -> Growth:
     for row in tracks.rows:
         if row.leaf is not None:
             dates_of.setdefault(row.track, []).append((row.date, row.leaf))
-    found: dict[str, dict[int, dict[int, Number]]] = {
+    numbers_of: dict[str, dict[int, dict[int, Number]]] = {
         trait: {
             track: {date: numbers[date][leaf][trait] for date, leaf in sights if trait in numbers[date][leaf]}
             for track, sights in sorted(dates_of.items())
@@ -121,16 +121,16 @@ def measure_growth(tracks: Tracks) -> Growth:
     points: list[GrowthPoint] = []
     curves = []
     for track, trait in product(sorted(dates_of), TRAITS):
-        seen = found[trait][track]
-        times = np.array([tracks.dates[date].time for date in seen])
-        values = np.array([number.value for number in seen.values()])
-        sds = np.array([number.sd for number in seen.values()])
-        for place, (date, number) in enumerate(seen.items()):
+        by_date = numbers_of[trait][track]
+        times = np.array([tracks.dates[date].time for date in by_date])
+        values = np.array([number.value for number in by_date.values()])
+        sds = np.array([number.sd for number in by_date.values()])
+        for place, (date, number) in enumerate(by_date.items()):
             near = slice(max(place - 1, 0), place + 2)
-            is_told = place > 0 or len(seen) > 2
+            is_told = place > 0 or len(by_date) > 2
             rates = slope(times[near], values[near], sds[near]) if is_told else (math.nan, math.nan)
             points.append(GrowthPoint(track, trait, date, number, *rates))
-        if trait in SIZES and len(seen) >= GROWTH.least_dates:
+        if trait in SIZES and len(by_date) >= GROWTH.least_dates:
             curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
 

@@ -116,13 +116,13 @@ class Pair:
     ) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
-        found = [1e-9]
+        sizes = [1e-9]
         for leaves in (first, second):
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
-                found += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
+                sizes += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
         nothing = np.zeros((len(first), len(second)))
-        return cls(first, second, days, knows_up, scale=max(found), links=nothing if links is None else links)
+        return cls(first, second, days, knows_up, scale=max(sizes), links=nothing if links is None else links)
 
     @property
     def fewer(self) -> int:

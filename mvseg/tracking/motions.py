@@ -48,24 +48,24 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     better = np.maximum(alike - alike[0], 0).sum(1)
     better[pose_distances(pair, pose, poses) < 1] = 0
     costs = fitted_costs(pair.moved(pose), LINKS)
-    alone, found = _total(costs), []
-    left = np.argsort(-better, kind="stable")
+    alone, motions = _total(costs), []
+    unpaired = np.argsort(-better, kind="stable")
     for _ in range(ALIGN.num_refined):
-        if not len(left) or not better[left[0]]:
+        if not len(unpaired) or not better[unpaired[0]]:
             break
-        at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
-        left = left[pose_distances(pair, at, poses[left]) >= 1]
+        at, own = poses[unpaired[0]], np.flatnonzero(alike[unpaired[0]] > alike[0])
+        unpaired = unpaired[pose_distances(pair, at, poses[unpaired]) >= 1]
         refined = refine_alignment(pair.take(own, np.arange(len(pair.second))), at)
         if pose_distances(pair, pose, refined.pose[None])[0] >= 1:
             others = fitted_costs(pair.moved(refined.pose), LINKS)
             rows, columns = best_pairs(np.minimum(costs, others)).T
             keep = others[rows, columns] < costs[rows, columns]
             pairs = np.stack([rows[keep], columns[keep]], 1)
-            found.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
-    best = max(found, key=lambda motion: motion.gain, default=None)
+            motions.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
+    best = max(motions, key=lambda motion: motion.gain, default=None)
     if best is None or best.gain < MOTIONS.least_gain:
         return None
-    rivals = (motion.gain for motion in found if _contradicts(motion.pairs, best.pairs))
+    rivals = (motion.gain for motion in motions if _contradicts(motion.pairs, best.pairs))
     return Motion(best.pose, best.pairs, best.gain, margin=best.gain - max(rivals, default=0.0))
 
 

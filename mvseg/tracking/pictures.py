@@ -53,11 +53,11 @@ def picture_leaves(result: Result, leaves: Collection[int], *, side: int = PAGE.
 
 def picture_plant(result: Result) -> bytes:
     """JPEG of all leaves in the photo in which they are largest, as `cut_picture`; nothing where there is no mask."""
-    shown = [labels_in_photo(result, view) > 0 for view in range(len(result.scene.views))]
-    view = int(np.argmax([mask.mean() for mask in shown]))
-    if not shown[view].any():
+    areas = [labels_in_photo(result, view) > 0 for view in range(len(result.scene.views))]
+    view = int(np.argmax([mask.mean() for mask in areas]))
+    if not areas[view].any():
         return b""
-    return cut_picture(_photo(result.scene.views[view].path, shown[view].shape), shown[view], side=PAGE.plant_side)
+    return cut_picture(_photo(result.scene.views[view].path, areas[view].shape), areas[view], side=PAGE.plant_side)
 
 
 def _inner_point(mask: np.ndarray) -> tuple[float, float]:

@@ -41,12 +41,12 @@ class Question:
 def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Question]:
     """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one. What the
     `links` answer is not asked again."""
-    said = {frozenset(pair) for link in links for pair in combinations(link.leaves, 2)}
+    linked = {frozenset(pair) for link in links for pair in combinations(link.leaves, 2)}
     every = sorted((*_of_links(tracks), *_of_ends(tracks)), key=lambda each: (-each.doubt, each.before, each.after))
     asked: list[Question] = []
     for each in every:
         is_new = all(each.before != other.before and each.after != other.after for other in asked)
-        is_answered = frozenset(each.link(tracks, is_same=True).leaves) in said
+        is_answered = frozenset(each.link(tracks, is_same=True).leaves) in linked
         if is_new and not is_answered and each.doubt >= PAGE.least_doubt and len(asked) < PAGE.most_questions:
             asked.append(each)
     return asked
@@ -101,11 +101,11 @@ def _name_day(tracks: Tracks, date: int) -> str:
 
 def _sights(tracks: Tracks) -> dict[int, list[tuple[Sight, float]]]:
     """{track: its leaves in the order of time, each with the probability of its link to the one before}."""
-    found: dict[int, list[tuple[Sight, float]]] = {}
+    sights: dict[int, list[tuple[Sight, float]]] = {}
     for row in tracks.rows:
         if row.leaf is not None:
-            found.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
-    return found
+            sights.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
+    return sights
 
 
 def _earlier_sights(tracks: Tracks) -> dict[Sight, Sight]:

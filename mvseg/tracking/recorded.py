@@ -116,11 +116,11 @@ def read_recorded_tracks(folder: Path) -> RecordedTracks:
     """
     if not is_tracks(folder):
         raise InputError(f"{folder}: holds no tracks.csv and {RUN_FILE}, expected the output of mvseg track")
-    said = read_json(folder / RUN_FILE, _Run)
-    if not said.config.plants or said.output is None:
+    record = read_json(folder / RUN_FILE, _Run)
+    if not record.config.plants or record.output is None:
         message = "an earlier version made these tracks, and did not say of which results and times"
         raise InputError(f"{folder}: {message}; expected those of mvseg track of this version")
-    from_here = said.output.of
+    from_here = record.output.of
 
     def find(stated: str) -> Path:
         moved = from_here.get(stated)
@@ -130,7 +130,8 @@ def read_recorded_tracks(folder: Path) -> RecordedTracks:
             raise InputError(f"{stated}: the result that {folder} was made of is gone, expected it there")
         return found
 
-    plants = tuple(PlantResults(each.plant, tuple(map(find, each.results)), each.times) for each in said.config.plants)
-    stated = said.config.corrections
+    listed = record.config.plants
+    plants = tuple(PlantResults(each.plant, tuple(map(find, each.results)), each.times) for each in listed)
+    stated = record.config.corrections
     corrections = Path(stated) if stated is not None and Path(stated).is_file() else None
-    return RecordedTracks(folder, plants, said.config.pots, corrections)
+    return RecordedTracks(folder, plants, record.config.pots, corrections)

@@ -157,11 +157,11 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
         M may be 0.
     """
     areas = torch.bincount(layers.flatten(), minlength=len(classes) + 1)[1:]
-    kept = (areas >= min_pixels).nonzero()[:, 0]
-    masks = torch.zeros((len(kept), *layers.shape[1:]), dtype=torch.bool)
+    rows = (areas >= min_pixels).nonzero()[:, 0]
+    masks = torch.zeros((len(rows), *layers.shape[1:]), dtype=torch.bool)
     for layer in layers:
-        masks |= layer == kept[:, None, None] + 1
-    return {"boxes": masks_to_boxes(masks).float(), "labels": classes[kept], "masks": masks.to(torch.uint8)}
+        masks |= layer == rows[:, None, None] + 1
+    return {"boxes": masks_to_boxes(masks).float(), "labels": classes[rows], "masks": masks.to(torch.uint8)}
 
 
 # --- the order of an epoch

@@ -119,12 +119,12 @@ def gather_samples(
     samples = []
     for view in labels.leaves.view_index.unique().tolist():
         x1, y1, x2, y2 = boxes[view].tolist()
-        seen = max(detector.transform.resize(torch.zeros(1, y2 - y1, x2 - x1))[0].shape)
-        scale = min(1.0, RECIPE.scale_range[1] * seen / max(x2 - x1, y2 - y1))
+        side = max(detector.transform.resize(torch.zeros(1, y2 - y1, x2 - x1))[0].shape)
+        scale = min(1.0, RECIPE.scale_range[1] * side / max(x2 - x1, y2 - y1))
         size = (max(1, round(scale * (y2 - y1))), max(1, round(scale * (x2 - x1))))
         labelled = labels.in_photo(view, photos(view), (x1, y1, x2, y2), size=size)
         if len(labelled.classes):
-            samples.append((labelled, seen))
+            samples.append((labelled, side))
     return samples
 
 

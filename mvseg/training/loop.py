@@ -311,15 +311,15 @@ def cut_log(path: Path, step: int) -> None:
     """Remove the records after `step`, and a torn last line: what a killed run did after its last checkpoint."""
     if not path.is_file():
         return
-    kept = []
+    rows = []
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
             record = json.loads(line)
         except json.JSONDecodeError:
             break
         if record["step"] <= step:
-            kept.append(line + "\n")
-    write_text_whole(path, "".join(kept))
+            rows.append(line + "\n")
+    write_text_whole(path, "".join(rows))
 
 
 def close_epoch(run: Run, state: TrainingState) -> None:

@@ -64,13 +64,13 @@ def measure_appearance(
                 shown = part.cut(photo)[sure] / 255
                 is_senescent = hues(shown) < YELLOW_DEG
                 colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
-    found = {}
+    numbers = {}
     for instance in surfaces:
         projected, visible = pixels[instance].tolist()
         share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
         without = dict.fromkeys(COLORS, GREY if has_photos else NO_PHOTOS)
-        found[instance] = {"visible_share": share} | (mean_colors(colors[instance]) if has_colors else without)
-    return found
+        numbers[instance] = {"visible_share": share} | (mean_colors(colors[instance]) if has_colors else without)
+    return numbers
 
 
 def sure_pixels(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
@@ -86,11 +86,11 @@ def mean_colors(views: list[tuple[int, Floats]]) -> dict[str, Measurement]:
     if not views:
         return dict.fromkeys(COLORS, NO_PIXELS)
     weights = np.array([count for count, _ in views], dtype=np.float64)
-    seen = np.stack([each for _, each in views])
-    red, green, blue, senescent = seen.T
+    colors = np.stack([each for _, each in views])
+    red, green, blue, senescent = colors.T
     greenness = (2 * green - red - blue) / np.maximum(2 * green + red + blue, 1e-9)
-    hue = hues((weights @ seen[:, :3] / weights.sum())[None])[0]
-    apart = (hues(seen[:, :3]) - hue + 180) % 360 - 180  # of the views; hues are on a circle
+    hue = hues((weights @ colors[:, :3] / weights.sum())[None])[0]
+    apart = (hues(colors[:, :3]) - hue + 180) % 360 - 180  # of the views; hues are on a circle
     table = np.column_stack([red, green, blue, greenness, senescent, apart])
     means = weights @ table / weights.sum()
     means[-1] = hue

@@ -97,23 +97,23 @@ def find_rejected(
         ("low_quality", ious, config.min_quality, "median IoU {:.2f} with its masks, asked for is {:g}"),
         ("few_sure_views", sure_views, config.min_sure_views, "{} sure views, asked for are {}"),
     )
-    found: dict[int, Rejection] = {}
+    rejections: dict[int, Rejection] = {}
     for kind, values, least, reason in limits:
         below = {instance: value for instance, value in values.items() if value < least}
-        found |= {instance: Rejection(kind, reason.format(value, least)) for instance, value in below.items()}
+        rejections |= {instance: Rejection(kind, reason.format(value, least)) for instance, value in below.items()}
     if not config.leaves_only:
-        return found
+        return rejections
     for instance, chance in stems.items():
-        if chance >= SURELY_STEM and instance not in found:
+        if chance >= SURELY_STEM and instance not in rejections:
             reason = f"looks like a stem: a tube explains its masks, probability {chance:.2f}"
-            found[instance] = Rejection("stem", reason)
-    bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
+            rejections[instance] = Rejection("stem", reason)
+    bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in rejections}
     rules: list[Callable[[dict[int, _Body]], dict[int, Rejection]]] = [find_distant]
     if up is not None:
         rules = [partial(find_floor, up=up), *rules]
     for rule in rules:
-        found |= rule({instance: body for instance, body in bodies.items() if instance not in found})
-    return dict(sorted(found.items()))
+        rejections |= rule({instance: body for instance, body in bodies.items() if instance not in rejections})
+    return dict(sorted(rejections.items()))
 
 
 def median_iou(surface: LeafSurface) -> float:
@@ -150,9 +150,9 @@ def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
     if sizes.max() <= len(bodies) / 2:
         return {}
     plant = group == sizes.argmax()
-    away, found = gaps[:, plant].min(1) / length, {}
+    away, rejections = gaps[:, plant].min(1) / length, {}
     for instance, steps, is_plant in zip(bodies, away, plant, strict=True):
         if not is_plant:
             reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
-            found[instance] = Rejection("beside_the_plant", reason)
-    return found
+            rejections[instance] = Rejection("beside_the_plant", reason)
+    return rejections

@@ -155,7 +155,7 @@ def measure_plant(
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
-    visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
+    visible = {instance: plant_stems["visible_share"].value for instance, plant_stems in appearance.items()}
     tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
     rejected = find_rejected(
         shapes,
@@ -167,19 +167,19 @@ def measure_plant(
     )
     rejected |= {instance: Rejection("stem", "its masks are of the category of stems") for instance in stems}
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
-    found: tuple[Stem, ...] = ()
+    plant_stems: tuple[Stem, ...] = ()
     if config.stems == "auto":
         seen = [each.tube for instance, each in tubes.items()
                 if instance in rejected and rejected[instance].kind == "stem" and each.tube.exists]  # fmt: skip
-        found = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
+        plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
     tilt_deg = 0.0
-    if frame is None and (up := up_of_stem(found, blades, scene.cameras)) is not None:
+    if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
         frame, tilt_deg = level_frame(up), TILT_DEG
     ground = extent = 0.0  # heights start from the lowest point of all blades
     if frame is not None and blades:
         points = np.concatenate([surface.points().numpy().reshape(-1, 3) for surface in blades.values()]) @ frame.T
         ground, extent = float(points[:, 2].min()), float(np.ptp(points[:, :2], axis=0).max())
-    of_leaf = {node.leaf: node for stem in found for node in stem.nodes}
+    of_leaf = {node.leaf: node for stem in plant_stems for node in stem.nodes}
     leaves = []
     for instance in instances:
         num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
@@ -201,18 +201,18 @@ def measure_plant(
             )
         )
     whole = tilt(measure_whole(blades, frame, num_leaves=len(instances) - len(rejected)), tilt_deg, extent=extent)
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=found)
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=plant_stems)
 
 
 def tilt(numbers: Mapping[str, Measurement], degrees: float, *, extent: float) -> dict[str, Measurement]:
     """The numbers, those that need up with what the stem tells of it: it leans by so many degrees (standard deviation),
     and heights by that over half of the `extent` of the plant; unchanged for 0."""
-    found = dict(numbers)
+    tilted = dict(numbers)
     for name, number in numbers.items():
         if degrees and number.exists and name in (*NEED_UP, "height"):
             error = degrees if DEFINITIONS[name].kind == "degree" else np.radians(degrees) * extent / 2
-            found[name] = Measurement(number.value, math.hypot(number.sd, error), f"{number.method}, up from the stem")
-    return found
+            tilted[name] = Measurement(number.value, math.hypot(number.sd, error), f"{number.method}, up from the stem")
+    return tilted
 
 
 def describe_leaf(
@@ -242,12 +242,12 @@ def describe_leaf(
     else:
         reasons = {"no_surface": "no credible surface", **reasons}
         why = "; ".join(reasons.values())
-    found = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
+    every_number = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     if isinstance(shape, LeafSurface):
-        found["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons.values())))
+        every_number["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons.values())))
     elif shape is not None and (num_parts := shape.num_pieces) > 1:
         reasons["pieces"] = f"in {num_parts} pieces"
-        found["iou"] = missing(f"{why}; in {num_parts} pieces")
+        every_number["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     kind = None if rejection is None else rejection.kind
-    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=kind, unit=unit)
+    return LeafTraits(leaf=instance, numbers=every_number, method=method, reasons=reasons, rejection=kind, unit=unit)

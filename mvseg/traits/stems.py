@@ -92,12 +92,12 @@ def find_stems(
         axes = tuple(axis for axis in axes if _rises(axis.tube, frame[2]))
     if not photos.exist:
         return _of_bases(axes, frame)
-    seen = see_plant(surfaces, masks, cameras, photos=photos)
-    axes = tuple(axis for axis in axes if seen.support(axis.tube.points()) >= SUPPORTED)
+    plant = see_plant(surfaces, masks, cameras, photos=photos)
+    axes = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
     if axes:
         return _of_bases(axes, frame)
-    path = find_path(seen.cells, seen.leaves)
-    if path is None or seen.support(path.points) < SUPPORTED:
+    path = find_path(plant.cells, plant.leaves)
+    if path is None or plant.support(path.points) < SUPPORTED:
         return ()
     return _of_path(path, surfaces, frame, upward)
 

@@ -99,14 +99,14 @@ class Statements:
     def candidates_as_seen(self, q: Floats, is_taken: Bools) -> Ints:
         """Candidate of each mask (D,) of a leaf that stays and that an edit is about, -1 for the others: the one that
         all masks of the leaf show best by q (D, K). Accepted candidates (K,) first, then all."""
-        found = np.full(len(q), -1)
+        of_mask = np.full(len(q), -1)
         leaves = np.unique(self.leaf[self.is_held & (self.leaf > 0)])
         if len(leaves):
             sums = np.stack([q[self.leaf == each].sum(0) for each in leaves])
             sums += len(q) * (is_taken & (sums > 0))
             for row, candidate in zip(*linear_sum_assignment(sums, maximize=True), strict=True):
-                found[self.is_held & (self.leaf == leaves[row])] = candidate
-        return found
+                of_mask[self.is_held & (self.leaf == leaves[row])] = candidate
+        return of_mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,15 +183,15 @@ def _accept(
 
 def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Chosen:
     """The leaves with their masks; one with too few of them is none, unless the user says so."""
-    leaf, shown = assign_masks(ranked.q[:, ranked.leaves], drawn)
+    leaf, q = assign_masks(ranked.q[:, ranked.leaves], drawn)
     if len(ranked.leaves):
         is_certain = ranked.certain.any(1)
-        leaf, shown = np.where(is_certain, ranked.certain.argmax(1), leaf), np.where(is_certain, 1.0, shown)
+        leaf, q = np.where(is_certain, ranked.certain.argmax(1), leaf), np.where(is_certain, 1.0, q)
     counts = np.bincount(leaf[leaf >= 0], minlength=len(ranked.leaves))
     is_left = (counts >= CHOICE.least_views) | ranked.stays
     place = np.append(np.where(is_left, is_left.cumsum() - 1, -1), -1)  # of no leaf, too
     leaf = place[leaf]
-    return Chosen(ranked.leaves[is_left], ranked.chances[is_left], leaf, shown * (leaf >= 0), ranked.steps)
+    return Chosen(ranked.leaves[is_left], ranked.chances[is_left], leaf, q * (leaf >= 0), ranked.steps)
 
 
 def same_class(candidates: Candidates, table: Masks) -> Bools:
@@ -211,18 +211,18 @@ def rank(
     view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
     for number, each in enumerate(drawn):
         view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
-    left, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
+    is_open, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
     sure, rows_of_views = log_odds(scores), [each.rows for each in drawn]
-    while left.any():
+    while is_open.any():
         best, row = best_masks(free, rows_of_views)
         features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
-        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
+        chances = np.where(is_open, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
         first = int(chances.argmax())
         own = best[:, first]
         rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
         rows = np.union1d(rows, np.flatnonzero(candidates.certain[:, first]))
         steps.append(Step(first, float(chances[first]), features[first], rows))
-        left[first] = False
+        is_open[first] = False
         for taken in rows.tolist():
             there = drawn[view[taken]]
             free[there.rows[there.is_shared[place[taken]]]] = 0
@@ -249,7 +249,7 @@ def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
     In every view the assignment of masks to the L leaves of `q` (D, L) with the largest sum of chances, each used once.
     Of two masks in it that show the same, the likelier one stays, and the other leaf takes its next best.
     """
-    leaf, shown = np.full(len(q), -1), np.zeros(len(q))
+    leaf, q_of = np.full(len(q), -1), np.zeros(len(q))
     for each in drawn if q.shape[1] else ():
         free = np.where(q[each.rows] >= CHOICE.least_shown, q[each.rows], 0.0)
         while True:
@@ -260,7 +260,7 @@ def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
             masks, leaves = masks[order], leaves[order]
             conflicts = np.flatnonzero(np.triu(each.is_shared[np.ix_(masks, masks)], 1).any(0))
             if not len(conflicts):
-                leaf[each.rows[masks]], shown[each.rows[masks]] = leaves, chances[order]
+                leaf[each.rows[masks]], q_of[each.rows[masks]] = leaves, chances[order]
                 break
             free[masks[conflicts[0]]] = 0
-    return leaf, shown
+    return leaf, q_of

@@ -109,26 +109,28 @@ def choose_leaves(
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
     table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
-    said = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
+    statements = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
     usable = np.ones(len(table), bool)
     if gone is not None:
         ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
         others = Masks.concatenate((gone.to("cpu"), matched.select(is_held & is_added)))
         usable[: len(proposals)] = _without(proposals, others)
-    found = [(replace(matched, instance_ids=ids), row_of)]
-    found += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
+    tables = [(replace(matched, instance_ids=ids), row_of)]
+    tables += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
     is_edited = gone is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
     has_shapes = _is_seen_around(more[0].to("cpu") if is_edited else matched, cameras)
     candidates = gather_candidates(
-        found, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache
+        tables, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache
     )
     views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
     is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
     for each in views:
         own = is_made[each.rows]
         usable[each.rows] &= own | ~each.is_shared[:, own].any(1)
-    chosen = choose(candidates, table, drawn=views, usable=usable, statements=said, min_probability=min_probability)
-    return _take(chosen, candidates, table, is_held=said.is_sure)
+    chosen = choose(
+        candidates, table, drawn=views, usable=usable, statements=statements, min_probability=min_probability
+    )
+    return _take(chosen, candidates, table, is_held=statements.is_sure)
 
 
 def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
@@ -232,7 +234,7 @@ def _stem_chances(
 ) -> Floats:
     """(K,) probability that each candidate, of these members of R' regions, is a stem."""
     ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
-    found = tube_evidence(
+    tubes = tube_evidence(
         regions.select(torch.cat(list(members))),
         ids,
         cameras,
@@ -240,7 +242,7 @@ def _stem_chances(
         least_aspect=TUBE.least_aspect,
     )
     stem = np.zeros(len(surfaces))
-    for number, evidence in found.items():
+    for number, evidence in tubes.items():
         stem[number - 1] = evidence.probability
     return stem
 
@@ -264,12 +266,12 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
         instance_ids=torch.from_numpy(ids),
         match_scores=torch.from_numpy(chosen.q[rows]).float(),
     )
-    shown = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
+    q = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
     shares = [each.shown for each in chosen.steps if each.candidate in taken and candidates.has_surface[each.candidate]]
     return Leaves(
         masks=masks,
-        surfaces={number: each for number, each in enumerate(shown, 1) if each is not None and each.is_credible},
+        surfaces={number: each for number, each in enumerate(q, 1) if each is not None and each.is_credible},
         probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
         rejected=tuple(
             RejectedCandidate(each.chance, table.select(torch.from_numpy(each.rows)))

@@ -156,8 +156,8 @@ def _fit(
     if colored is None or not others:
         return fit({}, None)
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in others})
-    left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in around}
-    parts = _find_parts(left, around)
+    rest = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in around}
+    parts = _find_parts(rest, around)
     best = None
     for _ in range(DRAWN.rounds):
         if not parts:
@@ -165,7 +165,7 @@ def _fit(
         best = fit(parts, best)
         if not best.exists:
             break
-        parts = _find_parts(left, _around(best, cameras, left))
+        parts = _find_parts(rest, _around(best, cameras, rest))
     is_own = None if best is None else torch.isin(best.views, own.view_index)
     if best is None or is_own is None or float(best.iou[is_own].min()) < EVIDENCE.fits:  # the outlines are certain
         best = fit({}, None)
@@ -174,13 +174,13 @@ def _fit(
 
 def _find_parts(remaining: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
     """{view: largest remaining part around the leaf's place}."""
-    found = {}
+    parts = {}
     for view in remaining:
         place = Crop.of(remaining[view] & around[view]) if (remaining[view] & around[view]).any() else None
         part = None if place is None else _largest_part(np.pad(place.pixels.numpy(), 1))[1:-1, 1:-1]
         if place is not None and part is not None and int(part.sum()) >= EVIDENCE.open_pixels:
-            found[view] = replace(place, pixels=torch.from_numpy(part.copy())).tighten()
-    return found
+            parts[view] = replace(place, pixels=torch.from_numpy(part.copy())).tighten()
+    return parts
 
 
 def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:
@@ -213,15 +213,15 @@ def _find_open(
 ) -> dict[int, tuple[Crop, Crop]]:
     """{view: the unhidden part of a leaf's surface, and what of it has the colour of leaves}, of the views without a
     mask of the leaf that show it openly."""
-    places, found = surface.project_parts(cameras), {}
+    places, open_views = surface.project_parts(cameras), {}
     for view in _views_without(masks, leaf):
         whole = places[view]
         visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
         leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
         is_open = visible.area >= max(EVIDENCE.open_pixels, DRAWN.least_visible * whole.area)
         if is_open and leaf_colored.area >= DRAWN.least_colored * visible.area:
-            found[view] = visible, leaf_colored
-    return found
+            open_views[view] = visible, leaf_colored
+    return open_views
 
 
 def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
@@ -234,15 +234,15 @@ def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
 def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
     """One region for each view that has masks of a leaf: these, and those of others that touch them and may hide more
     of it."""
-    shown, regions = {}, masks.regions
+    is_open, regions = {}, masks.regions
     for view in masks.view_index[masks.instance_ids == leaf].unique().tolist():
         here = (masks.view_index == view).nonzero()[:, 0].tolist()
         size, is_leaf = tuple(cameras.sizes[view].tolist()), masks.instance_ids == leaf
         frame = regions.label_map(view, is_leaf.long(), size).numpy() > 0
         near = _dilate(frame, DRAWN.beside_px)
         others = [regions.placed(row) for row in here if not is_leaf[row]]
-        shown[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
-    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), shown)
+        is_open[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
+    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), is_open)
 
 
 def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:

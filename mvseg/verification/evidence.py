@@ -88,18 +88,18 @@ def draw_views(
     the regions, where these were drawn before; they are not drawn again."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
-    shown = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
+    crops = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         step = -(-max(width, height) // EVIDENCE.most_px)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         rows = (regions.view_index == view).nonzero()[:, 0].numpy()
-        known = first[view] if first else None
-        new = rows if known is None else rows[len(known.rows) :]
+        first_views = first[view] if first else None
+        new = rows if first_views is None else rows[len(first_views.rows) :]
         pixels = _columns([regions.placed(row) for row in new.tolist()], size, step)
-        if known is not None:
-            pixels = hstack((known.masks, pixels), format="csc")
-        covered = _columns([parts[view] for parts in shown], size, step)
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], first=known))
+        if first_views is not None:
+            pixels = hstack((first_views.masks, pixels), format="csc")
+        covered = _columns([parts[view] for parts in crops], size, step)
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], first=first_views))
     return tuple(drawn)
 
 
@@ -116,13 +116,13 @@ def paint_view(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: int)
     """(H, W), at full size, the instance whose surface each pixel of a view shows, 0 = none. Surfaces that are not
     credible show and hide nothing."""
     width, height = cameras.sizes[view].tolist()
-    camera, shown = cameras[[view]].to("cpu"), np.zeros((height, width), np.int64)
+    camera, images = cameras[[view]].to("cpu"), np.zeros((height, width), np.int64)
     credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
     names, parts = list(credible), list(credible.values())
     for index in np.argsort(_depths(parts, camera)[0], kind="stable")[::-1].tolist():  # the farthest first
         part = parts[index].project_parts(camera)[0]
-        part.cut(shown)[part.pixels.numpy()] = names[index]
-    return shown
+        part.cut(images)[part.pixels.numpy()] = names[index]
+    return images
 
 
 def _columns(crops: Sequence[Crop], size: tuple[int, int], step: int) -> csc_array:
@@ -157,13 +157,13 @@ def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
     """(P, K) the parts without what nearer ones of `hides` cover."""
     parts, taken = drawn.parts, np.zeros(drawn.parts.shape[0], bool)
-    kept = np.ones(parts.nnz, np.int32)
+    pixels = np.ones(parts.nnz, np.int32)
     for index in np.argsort(drawn.depth, kind="stable").tolist():
         span = slice(parts.indptr[index], parts.indptr[index + 1])
-        kept[span] = ~taken[parts.indices[span]]
+        pixels[span] = ~taken[parts.indices[span]]
         if hides[index]:
             taken[parts.indices[span]] = True
-    return csc_array((kept, parts.indices, parts.indptr), shape=parts.shape)
+    return csc_array((pixels, parts.indices, parts.indptr), shape=parts.shape)
 
 
 def see_instances(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Evidence:

@@ -168,16 +168,17 @@ def leaf_features(
         clear: None: the clear leaves are found among these candidates.
     """
     weight = np.where(candidates.has_surface, share, best > 0)
-    shown = (weight * best).sum(0) / np.maximum(weight.sum(0), 1e-9)
+    mean_q = (weight * best).sum(0) / np.maximum(weight.sum(0), 1e-9)
     number, lengths = best.sum(0), candidates.lengths
     score = (best * sure).sum(0) / np.maximum(number, 1e-9)
     if clear is None:
-        is_clear = shown >= min(CHOICE.clear, shown.max(initial=0))
+        is_clear = mean_q >= min(CHOICE.clear, mean_q.max(initial=0))
         known = lengths[is_clear & candidates.has_surface]
         clear = ClearLeaves(float(np.median(score[is_clear])), float(np.median(known)) if len(known) else 1.0)
     relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
     relative = np.minimum(relative, 0.0)
-    columns = np.ones_like(shown), shown, np.log(number + 0.1), score - clear.score, relative, log_odds(candidates.fits)
+    fits = log_odds(candidates.fits)
+    columns = np.ones_like(mean_q), mean_q, np.log(number + 0.1), score - clear.score, relative, fits
     return np.stack(columns, 1), clear
 
 

@@ -36,9 +36,9 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
         odds: (D,) log odds that it shows that.
         config: that the masks were matched with.
     """
-    found: list[Masks] = []
+    matchings: list[Masks] = []
     if config.resolved_method != "nview" or masks.regions.num_views < AGAIN.least_views:
-        return found
+        return matchings
     for least in AGAIN.freed:
         is_free = (leaf < 0) | (odds < logit(least))
         if (is_free & (leaf >= 0)).any():
@@ -47,8 +47,8 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
             ids = again.masks.instance_ids
             is_old = torch.isin(ids, ids[torch.from_numpy(~is_free)])
             if again.report.method == "nview":
-                found.append(replace(again.masks.with_merged(()), instance_ids=ids.where(~is_old, -1)))
-    return found
+                matchings.append(replace(again.masks.with_merged(()), instance_ids=ids.where(~is_old, -1)))
+    return matchings
 
 
 def _links(leaf: Ints, is_free: Bools) -> Links:

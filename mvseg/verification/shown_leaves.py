@@ -169,14 +169,14 @@ def settle_masks(question: MaskQuestion, fitted: GivenScores = GIVEN) -> tuple[I
     most first."""
     odds, is_open = show_odds(question, fitted), question.is_known.copy()
     is_leaf = np.eye(len(is_open), dtype=bool)
-    found = assign(question, odds, is_open)
+    chosen = assign(question, odds, is_open)
     while True:
         later = np.flatnonzero(~is_open & question.candidates.is_credible).tolist()
         trials = [(leaf, assign(question, odds, is_open | is_leaf[leaf])) for leaf in later]
-        gains = [gained(question, found, tried, leaf) for leaf, tried in trials]
+        gains = [gained(question, chosen, tried, leaf) for leaf, tried in trials]
         if max(gains, default=0.0) <= fitted.price:
-            return found
-        leaf, found = trials[int(np.argmax(gains))]
+            return chosen
+        leaf, chosen = trials[int(np.argmax(gains))]
         is_open[leaf] = True
 
 

@@ -47,8 +47,8 @@ def check_categories(
             there = ", ".join(present) or "none"
             raise InputError(f"{source}: there is no category '{name}', expected of these: {there}")
     several = [name for name in counts if name and counts[name]]
-    shown = tuple(f"{counts[name]} {name}" for name in several)
+    names = tuple(f"{counts[name]} {name}" for name in several)
     if several and wanted and not set(several) & set(wanted):
-        warn(Finding("no_mask_of_category", str(source), {"wanted": tuple(wanted), "shown": shown}))
+        warn(Finding("no_mask_of_category", str(source), {"wanted": tuple(wanted), "shown": names}))
     if len(several) > 1 and not wanted:
-        warn(Finding("several_categories", str(source), {"count": len(several), "shown": shown}))
+        warn(Finding("several_categories", str(source), {"count": len(several), "shown": names}))

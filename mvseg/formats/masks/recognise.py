@@ -96,11 +96,11 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
 def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
     """The files below a folder that are neither the scene's cameras nor its photos, nor copies of these."""
     photos = [view.path for view in scene.views if view.path.is_file()]
-    known = {path.resolve() for path in (*photos, scene.source) if path is not None}
+    other_files = {path.resolve() for path in (*photos, scene.source) if path is not None}
     of_size: dict[int, list[Path]] = defaultdict(list)
     for photo in photos:
         of_size[photo.stat().st_size].append(photo)
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve() not in known]
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve() not in other_files]
     return [path for path in paths if not any(_is_copy(path, photo) for photo in of_size[path.stat().st_size])]
 
 
@@ -197,9 +197,9 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
     if unclear:
         raise InputError(f"{masks}: {unclear[0]}")
-    found = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
+    file = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
     if jsons:
-        message = f"holds {len(jsons)} JSON files ({found}), none of them named after a photo"
+        message = f"holds {len(jsons)} JSON files ({file}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
     archive = next((path for path in paths if path.suffix.lower() == ".npz"), None)
     if archive is not None:
@@ -208,4 +208,4 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
     if jpeg is not None:
         raise InputError(f"{jpeg}: is a JPEG, which blurs the numbers of masks: export PNG instead")
     expected = f"masks named {scene.views[0].name}.png or {scene.views[0].name}.json"
-    raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {found}")
+    raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {file}")

@@ -51,17 +51,17 @@ def stack_views(
         K = np.eye(3) if scene is None else scene.cameras.K[view].cpu().numpy()
         if isinstance(content, np.ndarray):
             between += count_between(content)
-            found = _crop_labels(content, lens, K)
+            parts = _crop_labels(content, lens, K)
         else:
-            found = _crop_masks(content, lens, K)
-        seen: set[tuple[Box, bytes]] = set()
-        for label, box, crop in found:
+            parts = _crop_masks(content, lens, K)
+        masks: set[tuple[Box, bytes]] = set()
+        for label, box, crop in parts:
             if box is None:
                 num_empty += 1
-            elif (key := (box, np.packbits(crop).tobytes())) in seen:
+            elif (key := (box, np.packbits(crop).tobytes())) in masks:
                 num_twice += 1
             else:
-                seen.add(key)
+                masks.add(key)
                 rows.append((view, box, torch.from_numpy(crop.flatten()), label))
     _say_left_out(len(rows), num_empty, num_twice, source=source)
     num_views = num_views or 0 if scene is None else len(scene.views)
@@ -79,11 +79,11 @@ def stack_views(
 
 def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
     """The masks of a label map, by their numbers."""
-    shown = undistort(labels, lens, K)
-    boxes = label_boxes(shown)
+    numbers = undistort(labels, lens, K)
+    boxes = label_boxes(numbers)
     for number in sorted(boxes if lens is None else label_boxes(labels)):
         x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 0, 0))
-        yield number, box if number in boxes else None, shown[y1:y2, x1:x2] == number
+        yield number, box if number in boxes else None, numbers[y1:y2, x1:x2] == number
 
 
 def _crop_masks(

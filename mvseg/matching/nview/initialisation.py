@@ -142,7 +142,7 @@ def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
 def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Floats:
     """(D, D) float32: on the rays of how many pixels of the first region some hypothesis names the second."""
     num = len(sweep.view_index)
-    shown = np.zeros((num, num), np.float32)
+    counts = np.zeros((num, num), np.float32)
     for block in blocks_of_runs(start, len(hypotheses)):
         here = sweep.labels[hypotheses[block]].astype(np.int64)
         first = run_starts(sweep.pixel[hypotheses[block]])
@@ -151,8 +151,8 @@ def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Floats:
         is_shown[run[:, None], np.maximum(here, -1)] = True
         owner = sweep.pixel_region[sweep.pixel[hypotheses[block]][first]]
         begin = run_starts(owner)
-        shown[owner[begin]] += np.add.reduceat(is_shown[:, :num], begin, 0, dtype=np.float32)
-    return shown
+        counts[owner[begin]] += np.add.reduceat(is_shown[:, :num], begin, 0, dtype=np.float32)
+    return counts
 
 
 def _share_belief(sweep: PlaneSweep, hypotheses: Ints, belief: Floats) -> Floats:

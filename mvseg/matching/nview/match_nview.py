@@ -51,19 +51,19 @@ def match_nview(
     """
     order = regions.view_index.argsort(stable=True)
     ordered, graph = regions.select(order), graph.select(order.cpu().numpy())
-    found = find_clusters(ordered, cameras, graph, residual_px=residual_px)
-    clusters, chance = part_pieces(found.scores, found.clusters)
-    evidence = collect_evidence(found.scores, clusters, found.pairwise)
+    best = find_clusters(ordered, cameras, graph, residual_px=residual_px)
+    clusters, chance = part_pieces(best.scores, best.clusters)
+    evidence = collect_evidence(best.scores, clusters, best.pairwise)
     report = MatchReport(
-        method=found.method,
+        method=best.method,
         has_probabilities=True,
-        residual_px=found.residual_px,
-        explained=found.scores.explained(clusters),
-        view_explained=torch.from_numpy(found.scores.explained_per_view(clusters)).float().to(regions.device),
+        residual_px=best.residual_px,
+        explained=best.scores.explained(clusters),
+        view_explained=torch.from_numpy(best.scores.explained_per_view(clusters)).float().to(regions.device),
     )
     probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
     masks = Masks.of(ordered.to("cpu"), clusters.instance_ids(), probabilities)
-    masks = masks.with_merged(find_merged(found.scores, clusters, ordered)).select(order.argsort().cpu())
+    masks = masks.with_merged(find_merged(best.scores, clusters, ordered)).select(order.argsort().cpu())
     masks = masks.relabel(_final_numbers(masks.instance_ids))
     return Matching(replace(masks.to(regions.device), regions=regions), report)
 

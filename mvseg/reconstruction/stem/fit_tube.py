@@ -170,15 +170,15 @@ def tube_distances(masks: MaskStack, axis: Floats, radii: Floats, *, reach: floa
     """How far both sides and both ends of a tube are from the edges of its masks; edges beyond `reach` do not count."""
     u = tube_places(TUBE.rows)
     basis, by_radius = spline_basis(u, AXIS), spline_basis(u, RADIUS)
-    seen = see_tube(masks.px_from_world, basis @ axis, _unit(axis_slopes(u) @ axis))
-    half = (seen.per_radius * np.maximum(by_radius @ radii, 0))[..., None] * seen.normals
+    ribbon = see_tube(masks.px_from_world, basis @ axis, _unit(axis_slopes(u) @ axis))
+    half = (ribbon.per_radius * np.maximum(by_radius @ radii, 0))[..., None] * ribbon.normals
     num = len(u)
     place = np.concatenate([np.arange(num), np.arange(num), ENDS])
-    tips, ahead = _tips(seen, by_radius @ radii)
-    px = np.concatenate([seen.px - half, seen.px + half, tips], 1).reshape(-1, 2)
-    normals = np.concatenate([-seen.normals, seen.normals, ahead], 1)
-    moves = np.einsum("ski,skij->skj", normals, seen.moves[:, place])
-    wider = np.concatenate([seen.per_radius, seen.per_radius, _caps(seen)], 1)
+    tips, ahead = _tips(ribbon, by_radius @ radii)
+    px = np.concatenate([ribbon.px - half, ribbon.px + half, tips], 1).reshape(-1, 2)
+    normals = np.concatenate([-ribbon.normals, ribbon.normals, ahead], 1)
+    moves = np.einsum("ski,skij->skj", normals, ribbon.moves[:, place])
+    wider = np.concatenate([ribbon.per_radius, ribbon.per_radius, _caps(ribbon)], 1)
     by_axis = (basis[place][None, :, :, None] * moves[:, :, None]).reshape(len(px), -1)
     jacobian = np.concatenate([by_axis, (wider[..., None] * by_radius[place]).reshape(len(px), -1)], 1)
     normals = normals.reshape(-1, 2)
@@ -190,7 +190,7 @@ def tube_distances(masks: MaskStack, axis: Floats, radii: Floats, *, reach: floa
     goes_on = masks.look_up(masks.inside, stack, px) & masks.look_up(masks.inside, stack, px + reach * normals)
     to_edge = np.where(is_end & goes_on, reach, to_edge)
     counts = np.isfinite(to_edge) & ~is_corner & ~(hidden & (to_edge < 0))
-    weight = seen.sine[:, place].ravel() * np.where(is_end, TUBE.end_weight, 1.0)
+    weight = ribbon.sine[:, place].ravel() * np.where(is_end, TUBE.end_weight, 1.0)
     weight *= np.where(is_end & (np.nan_to_num(to_edge) < 0), TUBE.shorten, 1.0)
     return TubeDistances(stack[counts], to_edge[counts], jacobian[counts], weight[counts], ~is_end[counts])
 
@@ -201,12 +201,12 @@ def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats)
     It is drawn as much too large or small as the mask of each view is, by `offsets` (S,) pixels.
     """
     u = tube_places(TUBE.rows)
-    seen = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
-    half = (seen.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * seen.normals
-    px = seen.px.copy()
-    px[:, ENDS] = _tips(seen, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
+    outline = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
+    half = (outline.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * outline.normals
+    px = outline.px.copy()
+    px[:, ENDS] = _tips(outline, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
     ribbon = np.stack([px - half, px, px + half], 2)
-    projection = Projection(ribbon, np.repeat(seen.depth[..., None], 3, 2))
+    projection = Projection(ribbon, np.repeat(outline.depth[..., None], 3, 2))
     drawn = draw_patch(masks, projection, offsets=offsets, is_blurred=False)
     return crop_ious(masks, drawn >= 0.5)
 
@@ -259,19 +259,19 @@ def apparent_widths(masks: MaskStack, axis: Floats) -> tuple[Floats, Floats]:
     NaN where nothing of the mask is there, another instance borders or interrupts it, or the view looks along the axis.
     """
     u = tube_places(TUBE.rows + 2)[1:-1]
-    seen = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
+    ribbon = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
     half = max(masks.size) // 2
     steps = np.arange(-half, half + 1.0)
-    px = seen.px[:, :, None] + steps[:, None] * seen.normals[:, :, None]
+    px = ribbon.px[:, :, None] + steps[:, None] * ribbon.normals[:, :, None]
     stack = np.broadcast_to(np.arange(len(masks))[:, None, None], px.shape[:3])
     place = masks.place_of(stack.ravel(), px.reshape(-1, 2))
     inside = masks.inside.ravel().take(place).reshape(px.shape[:3])
     hidden = masks.others.ravel().take(place).reshape(px.shape[:3]) != 0
     count = inside.sum(2)
     near = np.abs(steps) <= (count / 2 + TUBE.beside_px)[..., None]
-    is_good = (count > 0) & ~(hidden & near).any(2) & (seen.sine > TUBE.least_sine)
+    is_good = (count > 0) & ~(hidden & near).any(2) & (ribbon.sine > TUBE.least_sine)
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(is_good, count / seen.per_radius, np.nan), np.where(is_good, count, np.nan)
+        return np.where(is_good, count / ribbon.per_radius, np.nan), np.where(is_good, count, np.nan)
 
 
 def _weigh(distances: TubeDistances, scale_px: float) -> Floats:

@@ -114,14 +114,14 @@ def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tup
         One axis for each stem; () where fewer than `AXES.near_share` of the leaves point to any, as in a rosette.
     """
     first, second = find_ends(surfaces)
-    left, axes = np.ones(len(first), bool), []
-    while left.sum() >= (AXES.least_leaves if left.all() else AXES.least_of_many):
-        axis = _find_axis(first.select(left), second.select(left), up)
+    is_free, axes = np.ones(len(first), bool), []
+    while is_free.sum() >= (AXES.least_leaves if is_free.all() else AXES.least_of_many):
+        axis = _find_axis(first.select(is_free), second.select(is_free), up)
         if axis is None:
             break
         axes.append(axis)
-        left[left] = ~axis.is_near
-    return tuple(axes) if len(first) and 1 - left.mean() >= AXES.near_share else ()
+        is_free[is_free] = ~axis.is_near
+    return tuple(axes) if len(first) and 1 - is_free.mean() >= AXES.near_share else ()
 
 
 def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAxis | None:
@@ -129,12 +129,12 @@ def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAx
     nodes lie hardly farther apart along it than their petioles are long."""
     size = float(np.median(first.lengths))
     starts = _start_lines(first, second, up, size=size)
-    found = [_fit_axis(first, second, start, size=size) for start in starts]
+    fits = [_fit_axis(first, second, start, size=size) for start in starts]
     costs = [
         _cost(bases, nodes, distances, size) + _lean_cost(points[-1] - points[0], up, len(bases))
-        for points, bases, nodes, distances, _ in found
+        for points, bases, nodes, distances, _ in fits
     ]
-    points, bases, nodes, distances, along = found[int(np.argmin(costs))]
+    points, bases, nodes, distances, along = fits[int(np.argmin(costs))]
     is_near = distances < AXES.near * size
     if is_near.sum() < (AXES.least_leaves if is_near.mean() >= AXES.near_share else AXES.least_of_many):
         return None

@@ -133,13 +133,13 @@ def _find_petioles(
     cost, before, _ = dijkstra(
         graph.matrix, directed=False, indices=sources, min_only=True, return_predecessors=True
     )
-    found = {}
+    petioles = {}
     for leaf, index in graph.leaf_index.items():
         if np.isfinite(cost[index]):
             way = [place for place in trace_path(before, index) if place < len(cells.points)]
             end = leaves[leaf][cKDTree(leaves[leaf]).query(cells.points[way[-1]])[1]]
-            found[leaf] = np.concatenate([cells.points[way], end[None]])
-    return found
+            petioles[leaf] = np.concatenate([cells.points[way], end[None]])
+    return petioles
 
 
 def trace_path(before: NDArray, end: int) -> list[int]:

@@ -104,7 +104,7 @@ def tube_evidence(
     frames = instance_frames(regions, instance_ids, cameras)
     offsets = [each.offsets_px[each.offsets_px.isfinite()].numpy() for each in surfaces.values() if each.exists]
     errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-    sd_px, found = 0.0 if errors is None else errors.sd_px, {}
+    sd_px, evidence = 0.0 if errors is None else errors.sd_px, {}
     usual_aspect = float(np.median([each.length / each.width for each in surfaces.values() if each.exists]))
     for instance, surface in sorted(surfaces.items()):
         if not surface.exists or surface.length < least_aspect * usual_aspect * surface.width:
@@ -116,8 +116,8 @@ def tube_evidence(
         chosen = views[spread_views(cameras[views], TUBE.most_views)]
         members = members.select((members.view_index[:, None] == chosen).any(1))
         masks = stack_instance(members, cameras, frames, instance=instance)
-        found[instance] = compare_tube(masks, surface, usual_aspect=usual_aspect, mask_sd_px=sd_px)
-    return found
+        evidence[instance] = compare_tube(masks, surface, usual_aspect=usual_aspect, mask_sd_px=sd_px)
+    return evidence
 
 
 def compare_tube(

@@ -31,19 +31,19 @@ def find_starts(stacks: Sequence[MaskStack], *, is_rough: bool) -> list[tuple[Ma
     """
     turned = [_carve(masks.turn_world(masks.axes)) for masks in stacks]
     few = [_few_views(masks, hull.points.mean(0)) if len(hull.points) else masks for masks, hull in turned]
-    found = dict.fromkeys(range(len(stacks)), _Found())
+    ranked = dict.fromkeys(range(len(stacks)), _Found())
     for is_strict in (True, False):
-        searched = [index for index, (_, hull) in enumerate(turned) if len(hull.points) and not found[index].is_good]
+        searched = [index for index, (_, hull) in enumerate(turned) if len(hull.points) and not ranked[index].is_good]
         likely = {}
         for index in searched:
             hull = turned[index][1]
             seen = replace(hull, voxels=hull.voxels[hull.is_seen]) if is_strict else hull
             likely[index] = _likely_starts(few[index], seen, is_rough=is_rough)
         for part in (slice(1), slice(1, None)) if is_rough else (slice(None),):
-            tried = {index: starts[part] for index, starts in likely.items() if not found[index].is_good}
-            found |= _try_starts({index: starts for index, starts in tried.items() if starts}, few, found)
+            tried = {index: starts[part] for index, starts in likely.items() if not ranked[index].is_good}
+            ranked |= _try_starts({index: starts for index, starts in tried.items() if starts}, few, ranked)
     answers = []
-    for (masks, _), stack, each in zip(turned, stacks, found.values(), strict=True):
+    for (masks, _), stack, each in zip(turned, stacks, ranked.values(), strict=True):
         best = each.likely_best() if is_rough else each.best(SEARCH.most_fits)
         answers.append((masks.turn_world(stack.axes.T), [each.patches[index] @ stack.axes for index in best]))
     return answers

@@ -191,13 +191,13 @@ def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface]:
 
 
 def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
-    found: list[Approach | None] = []
+    fits: list[Approach | None] = []
     for masks, fit in _approach(asked, is_rough=False):
-        found.append(None)
+        fits.append(None)
         if fit is not None:
             views, coefficients, offsets_px = map(torch.from_numpy, (masks.views, fit.coefficients, fit.offsets_px))
-            found[-1] = Approach(views=views, coefficients=coefficients, offsets_px=offsets_px, spread=fit.spread)
-    return found
+            fits[-1] = Approach(views=views, coefficients=coefficients, offsets_px=offsets_px, spread=fit.spread)
+    return fits
 
 
 def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:

@@ -73,7 +73,7 @@ def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None
     A grid has its numbers of columns and rows, from edge to edge of the photo, and x and y of the moves, pixels, row by
     row; 0 where the photo shows nothing.
     """
-    known: dict[tuple[Any, ...], int] = {}
+    lens_of: dict[tuple[Any, ...], int] = {}
     lenses: list[dict[str, Any]] = []
     of_view: list[int | None] = []
     for index, view in enumerate(scene.views):
@@ -82,14 +82,14 @@ def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None
             continue
         (width, height), K = scene.cameras.sizes[index].tolist(), scene.cameras.K[index].cpu().numpy()
         name = (view.lens.model_name, *view.lens.params, *K.ravel().tolist(), width, height)
-        if name not in known:
-            known[name] = len(lenses)
+        if name not in lens_of:
+            lens_of[name] = len(lenses)
             rows = max(2, round(COLUMNS * height / width))
             x, y = np.meshgrid(np.linspace(0, width, COLUMNS), np.linspace(0, height, rows))
             points = np.stack((x.ravel(), y.ravel()), 1)
             moves = np.nan_to_num(photo_from_pinhole(view.lens, K, points) - points, nan=0, posinf=0, neginf=0)
             lenses.append({"columns": COLUMNS, "rows": rows, "moves": np.round(moves, 2).ravel().tolist()})
-        of_view.append(known[name])
+        of_view.append(lens_of[name])
     return lenses, of_view
 
 

@@ -39,7 +39,7 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
     """One entry per instance that has masks: id, colour, how likely it is a leaf (where the views chose it), shape,
     doubts, and its traits, if they were measured."""
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
-    found = []
+    leaves = []
     ids = result.masks.instance_ids
     for instance in ids[ids > 0].unique().tolist():
         about: dict[str, Any] = {"id": instance, "color": f"#{bytes(instance_color(instance)).hex()}"}
@@ -51,22 +51,22 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
             about |= {"shape": leaf.method, "use": leaf.use, "doubts": list(leaf.reasons.values())}
             about["isRejected"] = leaf.rejection is not None
             about["traits"] = describe_numbers(leaf.numbers, shown)
-        found.append(about)
-    return found
+        leaves.append(about)
+    return leaves
 
 
 def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Definition]) -> dict[str, Any]:
     """{trait: its value, standard deviation (None without one), and what it was measured on}; those that are missing
     have only a reason why."""
-    found: dict[str, Any] = {}
+    described: dict[str, Any] = {}
     for trait in traits:
         number = numbers[trait.name]
         if not number.exists:
-            found[trait.name] = {"why": number.method}
+            described[trait.name] = {"why": number.method}
             continue
         sd = float(format_number(number.sd)) if np.isfinite(number.sd) else None
-        found[trait.name] = {"value": float(format_number(number.value)), "sd": sd, "on": number.method}
-    return found
+        described[trait.name] = {"value": float(format_number(number.value)), "sd": sd, "on": number.method}
+    return described
 
 
 def describe_traits(traits: Traits | None) -> dict[str, Any]:

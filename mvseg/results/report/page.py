@@ -65,14 +65,14 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
 def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """All that the page shows, as its script reads it."""
     scene = result.scene
-    shown = zip(scene.views, pictures, describe_masks(result, pictures), strict=True)
+    pictures_of = zip(scene.views, pictures, describe_masks(result, pictures), strict=True)
     return {
         "plant": scene.name,
         "unit": scene.unit or "world unit",
         "numMasks": len(result.regions),
         "views": [
             {"name": view.name} | picture.as_json() | {"masks": masks, "stems": draw_lines(result, index, picture)}
-            for index, (view, picture, masks) in enumerate(shown)
+            for index, (view, picture, masks) in enumerate(pictures_of)
         ],
         "leaves": describe_leaves(result),
         "stems": describe_stems(result),
@@ -86,12 +86,12 @@ def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[s
 
 def describe_masks(result: Result, pictures: Sequence[Picture]) -> list[list[dict[str, Any]]]:
     """The outlined masks of each view."""
-    found = [[asdict(outline) for outline in picture.outlines] for picture in pictures]
+    described = [[asdict(outline) for outline in picture.outlines] for picture in pictures]
     scores = result.masks.detection_scores.tolist()
-    for mask in (mask for masks in found for mask in masks):
+    for mask in (mask for masks in described for mask in masks):
         if not math.isnan(scores[mask["region"]]):
             mask["detection_score"] = round(scores[mask["region"]], 4)
-    return found
+    return described
 
 
 def describe_update(result: Result, pictures: Sequence[Picture]) -> dict[str, Any]:

@@ -118,7 +118,7 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     regions, others = masks.regions, masks.second_ids.tolist()
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]
-    found = []
+    outlines = []
     for region in members.tolist():
         mask = regions.crop(region).cpu().numpy().astype(np.uint8)
         corner = np.array(regions.boxes[region, :2].tolist())
@@ -127,7 +127,7 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
         x, y = np.round(_place(np.array(middle) + corner + 0.5, box)).astype(int).tolist()
         thickness = 2 * radius * UNITS / (box[2] - box[0])
         score = float(masks.match_scores[region])
-        found.append(
+        outlines.append(
             MaskContour(
                 region=region,
                 leaf=int(masks.instance_ids[region]),
@@ -140,7 +140,7 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
                 other=others[region] if others[region] > 0 else None,
             )
         )
-    return found
+    return outlines
 
 
 def trace_mask(mask: NDArray[np.uint8], corner: NDArray[np.int64], *, box: Box) -> tuple[str, Box]:

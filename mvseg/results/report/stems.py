@@ -36,7 +36,7 @@ def draw_lines(result: Result, view: int, picture: Picture) -> list[dict[str, An
 
 def describe_stems(result: Result) -> list[dict[str, Any]]:
     """One entry per stem: what showed it, the phyllotaxis that it suggests, and its nodes, upwards."""
-    found = []
+    stems = []
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
         nodes = [
@@ -48,8 +48,8 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
             about["probability"] = round(suggested.probability, 3)
         if np.isfinite(suggested.angle):
             about["angle"] = suggested.angle
-        found.append(about)
-    return found
+        stems.append(about)
+    return stems
 
 
 def _rounded(value: float) -> float | None:
