@@ -50,6 +50,8 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
         masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
+    if best[0] is first:  # a species that the detector knows: no other size is worth a pass over all photos
+        return plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=boxes))
     sizes = [None if each is first else each.passes[0].longest for each in best]
     return plant_of_pass(opened, _run_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
 
