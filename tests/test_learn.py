@@ -88,7 +88,7 @@ def lower(plant: Plant, chance: float = 0.9) -> Plant:
         (3, (1.02, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
         ("off", (1.2,), 0, 0),
-        ("auto", (1.2, 1.2, 1.2, 1.2), 3, 3),
+        ("auto", (1.2, 1.2, 1.2), 2, 2),
     ],
 )
 def test_weights_stay_where_the_agreed_area_grows(
