@@ -110,6 +110,8 @@ class PassResult:
         report: of the sure ones.
         pixel: width of a pixel of the detector in the first pass, in pixels of the photos.
         findings: to warn of, if the result stays.
+        alone_area: agreed area of the better pass alone, where there are two: with the proposals of two, it is larger
+            even if leaves are no better, so that weights are rated by one.
     """
 
     passes: tuple[Pass, ...]
@@ -119,6 +121,7 @@ class PassResult:
     report: MatchReport
     pixel: float
     findings: tuple[Finding, ...] = ()
+    alone_area: float | None = None
 
     @property
     def agreed_area(self) -> float:
@@ -171,25 +174,17 @@ def join_passes(
     shifted = [
         replace(each, regions=replace(each.regions, labels=each.regions.labels + offset)) for each in second.matched
     ]
-    both = replace(
-        first,
-        passes=(*first.passes, *second.passes),
-        proposals=Masks.concatenate(sets),
-        matched=(*first.matched, *shifted),
-    )
+    passes, proposals = (*first.passes, *second.passes), Masks.concatenate(sets)
+    matched, alone = (*first.matched, *shifted), first.agreed_area
+    both = replace(first, passes=passes, proposals=proposals, matched=matched, alone_area=alone)
     return _choose(both, cameras, config=config, cache=cache)
 
 
-def _choose(
-    result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None
-) -> PassResult:
+def _choose(result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None) -> PassResult:
+    first, *more = result.matched
+    least = config.min_probability
     with timed("choose"):
         leaves = choose_leaves(
-            result.matched[0],
-            result.proposals,
-            cameras=cameras,
-            more=result.matched[1:],
-            min_probability=config.min_probability,
-            cache=cache,
+            first, result.proposals, cameras=cameras, more=more, min_probability=least, cache=cache
         )
     return replace(result, leaves=leaves)

@@ -143,5 +143,6 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
         boxes=whole_photos(opened.scene) if detected.boxes is None else detected.boxes,
         rejected=(),
         disagreement=opened.find_disagreement(matching),
+        alone_area=result.alone_area,
     )
     return plant.with_leaves(result.leaves) if opened.is_chosen else plant

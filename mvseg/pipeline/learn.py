@@ -62,7 +62,7 @@ def learn(
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
-    best, areas = plant, [plant.agreed_area]
+    best, areas = plant, [plant.rating]
     try:
         for number in range(1, (_count_rounds(plant) if rounds is None else rounds) + 1):
             with collect_warnings():  # what there is to say of edits, is said when they are applied
@@ -78,8 +78,8 @@ def learn(
                 report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             taught = _learn_once(best, labels, cache)
-            areas.append(taught.agreed_area)
-            if rounds is None and taught.agreed_area < GROWTH * best.agreed_area:
+            areas.append(taught.rating)
+            if rounds is None and taught.rating < GROWTH * best.rating:
                 break
             best = replace(taught, learned=replace(taught.learned, rounds=number))
     except KeyboardInterrupt:

@@ -49,6 +49,7 @@ class Plant:
         edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
         learned: weights that the detector learned from this plant.
+        alone_area: see `PassResult`.
         disagreement: finding on views that disagree about the masks, see `find_disagreement`; None: they agree.
     """
 
@@ -65,6 +66,7 @@ class Plant:
     refused: tuple[RejectedPixel, ...] = ()
     learned: Learned = NOTHING_LEARNED
     disagreement: Finding | None = None
+    alone_area: float | None = None
 
     @property
     def scene(self) -> Scene:
@@ -81,6 +83,11 @@ class Plant:
         """Pixels, see `rate_pass`."""
         pixel = self.longest_side / self.image_size
         return rate_pass(self.masks, self.instances.probabilities, pixel=pixel)
+
+    @property
+    def rating(self) -> float:
+        """Agreed area of one pass, pixels, by which weights are compared; see `PassResult.alone_area`."""
+        return self.agreed_area if self.alone_area is None else self.alone_area
 
     @property
     def longest_side(self) -> int:
