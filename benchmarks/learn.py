@@ -172,7 +172,7 @@ def main() -> None:
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
-            stays = stays and plant.agreed_area >= GROWTH * before.agreed_area
+            stays = stays and plant.rating >= GROWTH * before.rating
             name = f"round {number}, at {plant.image_size} px"
             runs.append(show(name, plant, truth, stays="yes" if stays else "no", begun=begun))
             if args.next is not None:

@@ -107,7 +107,7 @@ class Regions:
 
     def overlaps(self) -> list[tuple[int, int, int]]:
         """The pairs of regions of one view that share pixels: the earlier one, the later one, and how many."""
-        both: list[tuple[int, int, int]] = []
+        pairs: list[tuple[int, int, int]] = []
         views, boxes = self.view_index.cpu().numpy(), self.boxes.cpu().numpy()
         crops = [self.crop(row).cpu().numpy() for row in range(len(self))]
         for view in np.unique(views).tolist():
@@ -120,8 +120,8 @@ class Regions:
                 box = np.concatenate((np.maximum(*boxes[[one, other], :2]), np.minimum(*boxes[[one, other], 2:])))
                 parts = [crops[row][_slices(box - np.tile(boxes[row, :2], 2))] for row in (one, other)]
                 if (box[:2] < box[2:]).all() and (shared := int(np.count_nonzero(parts[0] & parts[1]))):
-                    both.append((one, other, shared))
-        return both
+                    pairs.append((one, other, shared))
+        return pairs
 
     def at(self, view: int, x: int, y: int) -> list[int]:
         """The regions of a view that show the pixel in column x, row y, ascending; none outside of the image."""

@@ -151,7 +151,7 @@ VAGUE = {"found", "known", "said", "seen", "shown", "left", "kept"}
 
 
 def test_vague_names_live_for_three_lines_at_most() -> None:
-    """Within a function; beside `right`, `left` is a side."""
+    """Within a function; beside another side, `left` is a side."""
     lasting = set()
     for module, source in MODULES.items():
         for function in (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)):
@@ -160,7 +160,7 @@ def test_vague_names_live_for_three_lines_at_most() -> None:
                 if isinstance(node, ast.Name):
                     lines.setdefault(node.id, []).append(node.lineno)
             vague = VAGUE & {name for name, each in lines.items() if max(each) - min(each) > 3}
-            sides = {"left"} if {"right", "top", "top_left", "last", "width"} & lines.keys() else set()
+            sides = {"left"} if {"right", "top", "bottom"} & lines.keys() else set()
             lasting |= {(module, function.name, name) for name in vague - sides}
     assert lasting == set()
 

@@ -139,7 +139,7 @@ def _print_table(check: Check, place: Path) -> None:
     width = max(4, *(len(view.name) for view in scene.views))
     line = f"{{:{width}}} {{:>11}} {{:>6}} {{:>6}} {{:>8}} {{:>6}} {{:>7}} {{:>5}} {{:>7}}"
     say(line.format("view", "size", "field", "next", "photo", "masks", "border", "fit", "miss"))
-    rows = {
+    forms = {
         "next_deg": "{:.0f}°",
         "photo": "{}",
         "masks": "{}",
@@ -148,7 +148,7 @@ def _print_table(check: Check, place: Path) -> None:
         "miss_px": "{:.0f} px",
     }
     for row, angle, size in zip(_rows(check), field_of_view(cameras), cameras.sizes.tolist(), strict=True):
-        known = ["-" if row[name] is None else form.format(row[name]) for name, form in rows.items()]
+        known = ["-" if row[name] is None else form.format(row[name]) for name, form in forms.items()]
         say(line.format(row["view"], "{} x {}".format(*size), f"{angle:.0f}°", *known))
     say()
 

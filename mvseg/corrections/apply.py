@@ -235,14 +235,14 @@ def _split(edited: _Edited, number: int, edit: Split, scene: Scene) -> _Edited:
 
 
 def _link(edited: _Edited, number: int, edit: Link, scene: Scene) -> _Edited:
-    every = []
+    keys_at = []
     for place in edit.at:
         edited, mask = _kept_mask_at(edited, number, place, scene)
-        every.append(mask.key)
-    keys = list(dict.fromkeys(every))
+        keys_at.append(mask.key)
+    keys = list(dict.fromkeys(keys_at))
     if edit.op == "same":
         ties = [_Tie(number, True, keys[0], key) for key in keys[1:]]
-    elif len(keys) < len(every):
+    elif len(keys) < len(keys_at):
         raise _Lost("two of its places show the same mask: split it")
     else:
         ties = [_Tie(number, False, one, other) for n, one in enumerate(keys) for other in keys[:n]]

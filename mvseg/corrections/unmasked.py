@@ -60,28 +60,28 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     (height, width), beside = rows.shape, DOUBTS.beside
     for label in range(1, count):
-        uncovered, top, wide, high, area = stats[label].tolist()
+        left, top, wide, high, area = stats[label].tolist()
         if area * step**2 < least_area:
             continue
-        is_inside = uncovered > 0 and top > 0 and uncovered + wide < width and top + high < height
+        is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
         if not is_inside or area > DOUBTS.most_share * rows.size:
             labels = np.where(_widest_place(labels == label), label, np.where(labels == label, 0, labels))
-            uncovered, top, wide, high = cv2.boundingRect((labels == label).astype(np.uint8))
+            left, top, wide, high = cv2.boundingRect((labels == label).astype(np.uint8))
             area = int((labels == label).sum())
             if area * step**2 < least_area:
                 continue
-        box = np.s_[max(top - beside, 0) : top + high + beside, max(uncovered - beside, 0) : uncovered + wide + beside]
+        box = np.s_[max(top - beside, 0) : top + high + beside, max(left - beside, 0) : left + wide + beside]
         part = (labels[box] == label).astype(np.uint8)
         if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < DOUBTS.compact * area:
             continue
         touched = rows[box][cv2.dilate(part, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0]
-        parts, numbers = np.unique(touched[touched >= 0], return_counts=True)
+        touching, numbers = np.unique(touched[touched >= 0], return_counts=True)
         lines, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         outline = cv2.approxPolyDP(max(lines, key=cv2.contourArea), 1.0, True)[:, 0]
         corner = np.array([box[1].start, box[0].start])
         yield Unmasked(
             view=view,
-            row=int(parts[numbers.argmax()]) if len(parts) else -1,
+            row=int(touching[numbers.argmax()]) if len(touching) else -1,
             area=float(area * step**2),
             outline=np.asarray((outline + corner + 0.5) * step, np.float64),
         )

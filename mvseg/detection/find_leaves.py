@@ -181,10 +181,7 @@ def join_passes(
 
 
 def _choose(result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None) -> PassResult:
-    first, *more = result.matched
-    least = config.min_probability
+    (first, *more), least = result.matched, config.min_probability
     with timed("choose"):
-        leaves = choose_leaves(
-            first, result.proposals, cameras=cameras, more=more, min_probability=least, cache=cache
-        )
+        leaves = choose_leaves(first, result.proposals, cameras=cameras, more=more, min_probability=least, cache=cache)
     return replace(result, leaves=leaves)

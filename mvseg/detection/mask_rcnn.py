@@ -235,17 +235,17 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
     """torchvision's result dicts of matched masks, best score first."""
     results = []
     for view, (width, height) in enumerate(sizes):
-        here = masks.select(masks.view_index == view)
-        here = here.select(here.detection_scores.argsort(descending=True, stable=True))
-        frames = [here.regions.mask(index, width, height) for index in range(len(here))]
+        in_view = masks.select(masks.view_index == view)
+        in_view = in_view.select(in_view.detection_scores.argsort(descending=True, stable=True))
+        frames = [in_view.regions.mask(index, width, height) for index in range(len(in_view))]
         empty = torch.zeros((0, height, width))
         result = {
-            "boxes": here.regions.boxes.float(),
-            "labels": here.classes,
-            "scores": here.detection_scores,
+            "boxes": in_view.regions.boxes.float(),
+            "labels": in_view.classes,
+            "scores": in_view.detection_scores,
             "masks": (torch.stack(frames).float() if frames else empty)[:, None],
-            "instance_ids": here.instance_ids,
-            "match_scores": here.match_scores,
+            "instance_ids": in_view.instance_ids,
+            "match_scores": in_view.match_scores,
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results

@@ -27,10 +27,10 @@ def gather_proposals(detections: Sequence[dict[str, Tensor]], sizes: list[list[i
         exactly, where it exceeds 0.5. And (R, 4) float32 xyxy, the detector's boxes in the frames of the images.
     """
     boxes, view_index, windows, crops = [], [], [], []
-    for view, (pixels, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
-        frame_width, frame_height = pixels["frame"].tolist()
-        scaled = resize_boxes(pixels["boxes"], [frame_height, frame_width], [height, width])
-        masks, scale = expand_masks(pixels["masks"], padding=1)
+    for view, (detected, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
+        frame_width, frame_height = detected["frame"].tolist()
+        scaled = resize_boxes(detected["boxes"], [frame_height, frame_width], [height, width])
+        masks, scale = expand_masks(detected["masks"], padding=1)
         for mask, pasted in zip(masks[:, 0], expand_boxes(scaled, scale).to(torch.int64), strict=True):
             x1, y1 = pasted[:2].clamp(min=0).tolist()
             x2, y2 = min(int(pasted[2]) + 1, width), min(int(pasted[3]) + 1, height)
@@ -42,5 +42,5 @@ def gather_proposals(detections: Sequence[dict[str, Tensor]], sizes: list[list[i
     device = boxes[0].device
     parts = [crop.cpu() for crop in crops]
     regions = stack_regions(view_index, windows, parts, labels=range(len(crops)), num_views=len(sizes)).to(device)
-    scores, classes = (torch.cat([pixels[key] for pixels in detections]) for key in ("scores", "labels"))
+    scores, classes = (torch.cat([detected[key] for detected in detections]) for key in ("scores", "labels"))
     return Masks.of(regions, detection_scores=scores, classes=classes, origin=Origin.DETECTED), torch.cat(boxes)

@@ -160,15 +160,15 @@ def _read_file(path: Path, scene: PhotoSet) -> CocoMasks:
 
 def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoMasks | None:
     """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
-    ids, data_set = {str(result.image_id) for result in results}, []
+    ids, fitting = {str(result.image_id) for result in results}, []
     for other in sorted(path.parent.glob("*.json")):
         try:
             listed = read_json(other, CocoMasks)
         except InputError:  # no COCO file, which includes the results
             continue
         if ids and ids <= {str(image.id) for image in listed.images}:
-            data_set.append(listed)
-    return data_set[0] if len(data_set) == 1 else None
+            fitting.append(listed)
+    return fitting[0] if len(fitting) == 1 else None
 
 
 def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) -> list[CocoImage]:
@@ -229,8 +229,8 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     views = find_views(names, scene, source=path, warn_of_loose=True)
     missing = [view for view in range(len(scene.views)) if view not in set(views)]
     if len(missing) == len(scene.views):
-        photos, images = list_some([view.path.name for view in scene.views]), list_some(names)
-        raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {images}")
+        photos, others = list_some([view.path.name for view in scene.views]), list_some(names)
+        raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {others}")
     if missing:
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         counts: Values = {"count": len(missing), "first": first_view, "found": tuple(names)}
@@ -239,8 +239,8 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     for image, view in zip(coco.images, views, strict=True):
         width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
         if view is not None and (image.width, image.height) not in ((0, 0), (width, height)):  # 0 x 0: not known
-            images = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
-            raise InputError(f"{path}: {images}{describe_turn(scene.views[view].path)}")
+            sizes = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
+            raise InputError(f"{path}: {sizes}{describe_turn(scene.views[view].path)}")
     return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
 
 

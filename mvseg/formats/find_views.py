@@ -47,24 +47,24 @@ def find_views(
         InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
     """
     in_source = "" if source is None else f"{source}: "
-    places = _exact_views(names, scene, in_source)
-    open_views = [view for view in range(len(scene.views)) if view not in set(places)]
+    view_indices = _exact_views(names, scene, in_source)
+    open_views = [view for view in range(len(scene.views)) if view not in set(view_indices)]
     bases = [base_name(scene.views[view].name) for view in open_views]
     view_of = {base: view for base, view in zip(bases, open_views, strict=True) if bases.count(base) == 1}
     first_of: dict[int, str] = {}
     for index, name in enumerate(names):
-        view = view_of.get(base_name(name)) if places[index] is None else None
+        view = view_of.get(base_name(name)) if view_indices[index] is None else None
         if view is None:
             continue
         if first_of.setdefault(view, name) != name:
             message = f"both {first_of[view]} and {name} could be view {view} ({scene.views[view].name})"
             raise InputError(f"{in_source}{message}, expected the path of its photo")
-        places[index] = view
+        view_indices[index] = view
     if first_of and warn_of_loose:
         view, name = next(iter(first_of.items()))
         first = f"{name} for {scene.views[view].name}"
         warn(Finding("base_names", str(source), {"count": len(first_of), "first": first}))
-    return places
+    return view_indices
 
 
 def base_name(name: str) -> str:

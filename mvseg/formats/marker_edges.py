@@ -70,12 +70,12 @@ def _find_edges(
     rising = values.mean(1) * step[:, None]
     half = (rising[:, 0] + rising[:, -1]) / 2
     after = (rising > half[:, None]).argmax(1)
-    is_inside = np.flatnonzero(after > 0)
-    low, high = rising[is_inside, after[is_inside] - 1], rising[is_inside, after[is_inside]]
-    places = ACROSS[after[is_inside] - 1] + (half[is_inside] - low) / (high - low) * (ACROSS[1] - ACROSS[0])
-    middle = np.column_stack([line, row + 0.5] if axis == 0 else [row + 0.5, line])[is_inside]
-    rows = np.zeros((len(is_inside), 9))
-    rows[:, 3 * axis : 3 * axis + 3] = np.column_stack([np.ones(len(is_inside)), middle])
+    crossed = np.flatnonzero(after > 0)
+    low, high = rising[crossed, after[crossed] - 1], rising[crossed, after[crossed]]
+    places = ACROSS[after[crossed] - 1] + (half[crossed] - low) / (high - low) * (ACROSS[1] - ACROSS[0])
+    middle = np.column_stack([line, row + 0.5] if axis == 0 else [row + 0.5, line])[crossed]
+    rows = np.zeros((len(crossed), 9))
+    rows[:, 3 * axis : 3 * axis + 3] = np.column_stack([np.ones(len(crossed)), middle])
     rows[:, 6:8] = middle[:, axis, None] * middle
-    rows[:, 8] = step[is_inside]
-    return rows, places, np.isin(line[is_inside], (0, len(is_white)))
+    rows[:, 8] = step[crossed]
+    return rows, places, np.isin(line[crossed], (0, len(is_white)))

@@ -33,15 +33,15 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
         return plant
     opened, cameras, config = plant.opened, plant.scene.cameras, plant.opened.config
     with timed("correct"):
-        visible, before = plant.shown, plant.masks.to("cpu")
-        corrected = apply(corrections, visible, plant.scene)
+        editable, before = plant.shown, plant.masks.to("cpu")
+        corrected = apply(corrections, editable, plant.scene)
         corrected = link_halves(corrected, before, cameras.to("cpu"))
         previous = seen_ids(corrected.masks, before) if opened.is_chosen else torch.full_like(corrected.last_edits, -1)
         previous = previous.where(torch.isin(previous, leaves_as_seen(corrected, previous, before)), -1)
     with timed("match"):
         matched, previous = _match_anew(plant, corrected, previous)
     masks, corrected = apply_everywhere(corrected, matched.masks)
-    if len(visible) and not len(masks):
+    if len(editable) and not len(masks):
         warn(Finding("no_leaf_left"))
     edited = replace(
         matched, instances=Instances(), rejected=(), edits=corrected.fates, refused=corrected.refused
@@ -64,7 +64,7 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
             plant.proposals,
             cameras=cameras,
             more=plant.matched,
-            gone=_taken_away(visible, masks),
+            gone=_taken_away(editable, masks),
             previous=seen_ids(masks, replace(corrected.masks, instance_ids=previous)),
             drawn=plant.drawn,
             min_probability=config.detect.min_probability,

@@ -56,7 +56,7 @@ def learn(
         plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of the user, whose masks are certain.
-        rounds: that the user asks for, who judges himself: so many are learned, and the last weights stay. None: as
+        rounds: that the user asks for: so many are learned, and the last weights stay, for the user to judge. None: as
             many as `RunConfig.learn` says, and the agreed area judges.
 
     Returns:

@@ -170,18 +170,18 @@ def _initialise(
     """
     first = max(poses, key=lambda name: len(poses[name]))
     cam_from_world, angles, world_from_board = _initial_world(poses[first], middle)
-    photos = {first: cam_from_world}
-    while len(photos) < len(poses):
-        name = max(poses.keys() - photos.keys(), key=lambda name: (len(poses[name].keys() & angles.keys()), name))
+    placed = {first: cam_from_world}
+    while len(placed) < len(poses):
+        name = max(poses.keys() - placed.keys(), key=lambda name: (len(poses[name].keys() & angles.keys()), name))
         common = sorted(poses[name].keys() & angles.keys())
         if not common:
             raise InputError(f"camera {name}: it sees the board at no angle at which another camera does")
-        photos[name] = poses[name][common[0]] * (_turn_z(angles[common[0]]) * world_from_board).inverse()
+        placed[name] = poses[name][common[0]] * (_turn_z(angles[common[0]]) * world_from_board).inverse()
         for place, pose in poses[name].items():
-            turned = photos[name].inverse() * pose * world_from_board.inverse()
+            turned = placed[name].inverse() * pose * world_from_board.inverse()
             angles.setdefault(place, float(np.degrees(_rotation(turned).as_rotvec()[2])))
     zero = angles[min(angles)]
-    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in photos.items()}
+    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in placed.items()}
     cameras = {
         name: replace(lens, R=at_zero[name].rotation.matrix(), t=at_zero[name].translation)
         for name, lens in lenses.items()

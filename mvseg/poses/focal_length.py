@@ -77,11 +77,11 @@ def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
         own.update_point_3d_errors()
         covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), own, adjuster)
     cameras = [own.cameras[number] for number in sorted(own.cameras)]
-    zooms = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
-    if any(each is None for each in zooms):
+    covariances = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
+    if any(each is None for each in covariances):
         return None
     lengths = np.array([each.params[0] for each in cameras])
-    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in zooms if each is not None])
+    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in covariances if each is not None])
     groups: dict[int, list[int]] = {}
     for place, number in enumerate(sorted(own.cameras)):
         groups.setdefault(model.images[number].camera_id, []).append(place)

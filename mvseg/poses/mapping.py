@@ -92,11 +92,11 @@ def find_structure(
     for image in list(model.images.values()):
         image.name = photo_of[image.name].name
     registered = {image.name for image in model.images.values() if image.has_pose}
-    given_lens: set[int] = set()
+    earlier: set[int] = set()
     counts = []  # of the photos of each model that none before it holds
     for each in models:
-        counts.append(len(set(each.reg_image_ids()) - given_lens))
-        given_lens |= set(each.reg_image_ids())
+        counts.append(len(set(each.reg_image_ids()) - earlier))
+        earlier |= set(each.reg_image_ids())
     return Structure(
         model=model,
         registered=tuple(photo.name for photo in photos if photo.name in registered),

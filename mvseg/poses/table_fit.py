@@ -124,8 +124,8 @@ def fit_table(
 
     def split(numbers: Floats) -> tuple[list[TableCamera], Floats, Floats]:
         each, rest = np.split(numbers, [of_cameras.size])
-        solution = [_with_numbers(*pair) for pair in zip(cameras, each.reshape(of_cameras.shape), strict=True)]
-        return solution, np.append(rest[:5], shift[2]), np.append(np.radians(angles[0]), rest[5:])
+        adjusted = [_with_numbers(*pair) for pair in zip(cameras, each.reshape(of_cameras.shape), strict=True)]
+        return adjusted, np.append(rest[:5], shift[2]), np.append(np.radians(angles[0]), rest[5:])
 
     def residuals(numbers: Floats) -> Floats:
         lenses = numbers[: of_cameras.size].reshape(of_cameras.shape)[:, 1:num_lens]
@@ -133,15 +133,15 @@ def fit_table(
         return np.append(_project(*split(numbers), sightings) / noise_px, unusual)
 
     fit = least_squares(residuals, start, x_scale="jac", ftol=tolerance, max_nfev=200)
-    solution, pose, turned = split(fit.x)
+    adjusted, pose, turned = split(fit.x)
     if not fix_lenses:
         variances = np.diag(np.linalg.pinv(fit.jac.T @ fit.jac))[: of_cameras.size].reshape(of_cameras.shape)[:, 0]
         sizes = [max(camera.size) for camera in cameras]
         deviations = np.sqrt(variances.clip(min=0)) * sizes
-        pairs = zip(solution, deviations.tolist(), strict=True)
-        solution = [replace(camera, focal_deviation=deviation) for camera, deviation in pairs]
-    errors = _project(solution, pose, turned, sightings)
-    return TableFit(cameras=solution, angles=np.degrees(turned), residuals=errors, cost=2 * float(fit.cost))
+        pairs = zip(adjusted, deviations.tolist(), strict=True)
+        adjusted = [replace(camera, focal_deviation=deviation) for camera, deviation in pairs]
+    errors = _project(adjusted, pose, turned, sightings)
+    return TableFit(cameras=adjusted, angles=np.degrees(turned), residuals=errors, cost=2 * float(fit.cost))
 
 
 def _camera_numbers(camera: TableCamera) -> Floats:

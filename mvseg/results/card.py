@@ -48,14 +48,15 @@ def make_card(result: Result, out: Path) -> Card:
 
 def _say_found(result: Result) -> str:
     num_photos, num_leaves = len(result.scene.views), result.matching.num_instances
-    parts = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
+    sentence = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
     if result.traits is not None and (counted := int(result.traits.whole["number_of_leaves"].value)) != num_leaves:
-        parts += f", {counted} of which count in the plant's traits"
+        sentence += f", {counted} of which count in the plant's traits"
     if result.learned.rounds:
-        parts += f", seen by a detector that learned this plant in {_count(result.learned.rounds, 'round', 'rounds')}"
+        rounds = _count(result.learned.rounds, "round", "rounds")
+        sentence += f", seen by a detector that learned this plant in {rounds}"
     if result.traits is not None and (area := result.traits.whole["total_leaf_area"]).exists and num_leaves:
-        parts += f"; total area {_say_number(area.value, area.sd)} {result.traits.unit or 'world unit'}^2"
-    return parts
+        sentence += f"; total area {_say_number(area.value, area.sd)} {result.traits.unit or 'world unit'}^2"
+    return sentence
 
 
 def _gravest(result: Result) -> Finding | None:

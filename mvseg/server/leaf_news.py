@@ -53,11 +53,11 @@ def tell_drawn(result: Result, *, new: Sequence[Edit], angles: NDArray[np.int64]
         outlined = masks.view_index[own & is_drawn].unique().tolist()
         found = len(set(masks.view_index[own].tolist()) - set(outlined))
         photos = "one photo" if len(outlined) == 1 else f"{len(outlined)} photos"
-        news = f"Leaf {leaf}: drawn in {photos}, found in {found} of {len(views) - len(outlined)} others"
+        sentence = f"Leaf {leaf}: drawn in {photos}, found in {found} of {len(views) - len(outlined)} others"
         if not found:
             widest = max((int(angles[pair]) for pair in combinations(outlined, 2)), default=0)
             why = "one photo tells no shape" if len(outlined) == 1 else f"they are {widest} degrees apart"
             why = why if widest < LEAST_APART else "its shape fits no other photo"
-            news += f": {why}. Outline it in a photo {PARTNERS[0]} to {PARTNERS[1]} degrees away, too"
-        sentences.append(f"{news}.")
+            sentence += f": {why}. Outline it in a photo {PARTNERS[0]} to {PARTNERS[1]} degrees away, too"
+        sentences.append(f"{sentence}.")
     return sentences

@@ -111,7 +111,7 @@ def list_poses(pair: Pair) -> Poses:
     it stood."""
     if not pair.fewer:
         return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
-    asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.links < 0)[..., None]]
+    asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.link_costs < 0)[..., None]]
     looked_at = np.concatenate([np.eye(4)[None], *asked])
     poses = np.concatenate([looked_at, draw_poses(pair)])
     rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
@@ -243,7 +243,7 @@ def refine_alignment(pair: Pair, pose: Floats) -> Alignment:
         if not len(pairs) or np.array_equal(pairs, before):
             break
         # what the pairs weigh as if nobody had said that they are one leaf
-        own = np.maximum(pair.links - costs, np.where(pair.links < 0, ALIGN.least_weight, 0.0))
+        own = np.maximum(pair.link_costs - costs, np.where(pair.link_costs < 0, ALIGN.least_weight, 0.0))
         pose = _fit(pair, pairs, own[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
     else:
         costs = fitted_costs(pair.moved(pose))

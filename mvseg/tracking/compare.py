@@ -74,7 +74,7 @@ def compare_dates(
     for said, cost in ((same, -LINKING.said), (different, LINKING.said)):
         for (earlier, row), (later, column) in said:
             if (earlier, later) in pairs:
-                pairs[earlier, later].links[row, column] = cost
+                pairs[earlier, later].link_costs[row, column] = cost
     looked = {place: list_poses(pair) for place, pair in pairs.items()}
     habit = Habit.of([judge(poses, Habit.of([], pots)) for poses in looked.values()], pots)
     poses, roots, steady = place_dates(len(dates), looked, habit)

@@ -126,7 +126,7 @@ class Differences:
 def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = None) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
     likelier than not. What the user says of them counts, too. `widths`: see `Differences`."""
-    return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.links
+    return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.link_costs
 
 
 def costs_of(apart: Differences, scales: Scales) -> Floats:

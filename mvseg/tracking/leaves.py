@@ -100,7 +100,7 @@ class Pair:
         days: between the dates, > 0.
         knows_up: +z is up in both frames.
         scale: what places are measured in, see `Pair.of`.
-        links: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
+        link_costs: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
     """
 
     first: DateLeaves
@@ -108,11 +108,11 @@ class Pair:
     days: float
     knows_up: bool
     scale: float
-    links: Floats
+    link_costs: Floats
 
     @classmethod
     def of(
-        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, links: Floats | None = None
+        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, link_costs: Floats | None = None
     ) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
@@ -121,8 +121,8 @@ class Pair:
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
                 sizes += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
-        nothing = np.zeros((len(first), len(second)))
-        return cls(first, second, days, knows_up, scale=max(sizes), links=nothing if links is None else links)
+        costs = np.zeros((len(first), len(second))) if link_costs is None else link_costs
+        return cls(first, second, days, knows_up, scale=max(sizes), link_costs=costs)
 
     @property
     def fewer(self) -> int:
@@ -135,5 +135,5 @@ class Pair:
 
     def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
         """Some leaves of either date, with a scale of their own."""
-        first, second, links = self.first.take(rows), self.second.take(columns), self.links[np.ix_(rows, columns)]
-        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, links=links)
+        first, second, costs = self.first.take(rows), self.second.take(columns), self.link_costs[np.ix_(rows, columns)]
+        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, link_costs=costs)

@@ -116,13 +116,13 @@ def track_leaves(
         else date_of(result, time)
         for result, time in zip(results, written, strict=True)
     ]))  # fmt: skip
-    compared, links_between = _link_dates(dates, links, pots)
-    believed = _without_stems(dates, links_between, {leaf for link in links for leaf in link.leaves})
+    compared, associations = _link_dates(dates, links, pots)
+    believed = _without_stems(dates, associations, {leaf for link in links for leaf in link.leaves})
     if believed != dates:
         dates = believed
-        compared, links_between = _link_dates(dates, links, pots)
+        compared, associations = _link_dates(dates, links, pots)
     return Tracks(
-        plant=plant, dates=dates, rows=_rank_tracks(_rows(dates, links_between, compared.roots), dates, compared),
+        plant=plant, dates=dates, rows=_rank_tracks(_rows(dates, associations, compared.roots), dates, compared),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
         findings=tuple(_find_doubts(dates, compared)), chances=pairwise_chances(compared),
     )  # fmt: skip

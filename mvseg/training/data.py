@@ -118,13 +118,13 @@ def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> Sample
         other = by_stem.setdefault(path.relative_to(photos).with_suffix("").as_posix(), path)
         if other is not path:
             raise InputError(f"{other} and {path} would share one label image, expected one photo per stem")
-    masks_found = _Photos(tuple(View(stem, path) for stem, path in by_stem.items()))
-    masks = recognise_masks(masks_found, labels)
+    photo_set = _Photos(tuple(View(stem, path) for stem, path in by_stem.items()))
+    masks = recognise_masks(photo_set, labels)
     if masks.kind == "COCO":
-        return _list_coco(photos, masks_found, masks, crowd=crowd)
+        return _list_coco(photos, photo_set, masks, crowd=crowd)
     samples = [
         Sample(name=view.path.relative_to(photos).as_posix(), photo=view.path, kind=masks.kind, files=files)
-        for view, files in zip(masks_found.views, masks.files, strict=True)
+        for view, files in zip(photo_set.views, masks.files, strict=True)
     ]
     samples += _list_lone(photos, labels, masks)
     return SampleList(tuple(sorted(samples, key=lambda sample: sample.name)), (CATEGORY,))
@@ -139,14 +139,14 @@ def _list_lone(photos: Path, labels: Path, masks: MaskFiles) -> list[Sample]:
     return [Sample(name=stem.as_posix(), photo=photos / stem, kind=masks.kind) for stem in stems]
 
 
-def _list_coco(photos: Path, listed: _Photos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
+def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
     """Those that a COCO file lists. Classes 1, 2, ... are the categories, ordered by their ids."""
-    labels, content = masks.source, read_files(masks.files[0], listed)
+    labels, content = masks.source, read_files(masks.files[0], photo_set)
     categories = sorted(content.categories, key=lambda category: (isinstance(category.id, str), category.id))
     if not content.images or not categories:
         counts = f"{len(content.images)} images and {len(categories)} categories"
         raise InputError(f"{labels} lists {counts}, expected some of each")
-    views = find_views([image.file_name for image in content.images], listed, source=labels, warn_of_loose=True)
+    views = find_views([image.file_name for image in content.images], photo_set, source=labels, warn_of_loose=True)
     check_images_once(labels, content, views)
     annotations_of: dict[str, list[CocoAnnotation]] = defaultdict(list)
     for annotation in content.annotations:
@@ -166,7 +166,7 @@ def _list_coco(photos: Path, listed: _Photos, masks: MaskFiles, *, crowd: Crowd)
         problem = file_name_problem(image.file_name, folder="the folder of the photos") if view is None else None
         if problem:
             raise InputError(f"{labels}: image {image.file_name}: {problem}")
-        photo = photos / image.file_name if view is None else listed.views[view].path
+        photo = photos / image.file_name if view is None else photo_set.views[view].path
         own = annotations_of[str(image.id)]
         taken = [each.model_copy(update={"iscrowd": 0}) for each in own] if crowd == "mask" else own
         size = (image.width, image.height) if image.width or image.height else None  # 0 x 0: not known

@@ -155,7 +155,7 @@ def measure_plant(
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
-    visible = {instance: plant_stems["visible_share"].value for instance, plant_stems in appearance.items()}
+    visible = {instance: numbers["visible_share"].value for instance, numbers in appearance.items()}
     tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
     rejected = find_rejected(
         shapes,
@@ -242,12 +242,12 @@ def describe_leaf(
     else:
         reasons = {"no_surface": "no credible surface", **reasons}
         why = "; ".join(reasons.values())
-    every_number = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
+    of_trait = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     if isinstance(shape, LeafSurface):
-        every_number["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons.values())))
+        of_trait["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons.values())))
     elif shape is not None and (num_parts := shape.num_pieces) > 1:
         reasons["pieces"] = f"in {num_parts} pieces"
-        every_number["iou"] = missing(f"{why}; in {num_parts} pieces")
+        of_trait["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     kind = None if rejection is None else rejection.kind
-    return LeafTraits(leaf=instance, numbers=every_number, method=method, reasons=reasons, rejection=kind, unit=unit)
+    return LeafTraits(leaf=instance, numbers=of_trait, method=method, reasons=reasons, rejection=kind, unit=unit)

@@ -162,8 +162,8 @@ def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:
     Raises:
         InputError: it cannot be read, or has no such column.
     """
-    (_, read), *rows = read_table(path, "a table that mvseg wrote", most=MOST_BYTES) or [(0, [])]
-    missing_ones = [column for column in columns if column not in read]
+    (_, header), *rows = read_table(path, "a table that mvseg wrote", most=MOST_BYTES) or [(0, [])]
+    missing_ones = [column for column in columns if column not in header]
     if missing_ones:
         raise InputError(f"{path}: has no column '{missing_ones[0]}', expected a table that mvseg wrote")
-    return [dict(zip_longest(read, cells[: len(read)], fillvalue="")) for _, cells in rows]
+    return [dict(zip_longest(header, cells[: len(header)], fillvalue="")) for _, cells in rows]

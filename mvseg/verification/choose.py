@@ -266,12 +266,12 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
         instance_ids=torch.from_numpy(ids),
         match_scores=torch.from_numpy(chosen.q[rows]).float(),
     )
-    q = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
+    surfaces = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
     shares = [each.shown for each in chosen.steps if each.candidate in taken and candidates.has_surface[each.candidate]]
     return Leaves(
         masks=masks,
-        surfaces={number: each for number, each in enumerate(q, 1) if each is not None and each.is_credible},
+        surfaces={number: each for number, each in enumerate(surfaces, 1) if each is not None and each.is_credible},
         probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
         rejected=tuple(
             RejectedCandidate(each.chance, table.select(torch.from_numpy(each.rows)))

@@ -234,15 +234,15 @@ def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
 def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
     """One region for each view that has masks of a leaf: these, and those of others that touch them and may hide more
     of it."""
-    is_open, regions = {}, masks.regions
+    hiding, regions = {}, masks.regions
     for view in masks.view_index[masks.instance_ids == leaf].unique().tolist():
         here = (masks.view_index == view).nonzero()[:, 0].tolist()
         size, is_leaf = tuple(cameras.sizes[view].tolist()), masks.instance_ids == leaf
         frame = regions.label_map(view, is_leaf.long(), size).numpy() > 0
         near = _dilate(frame, DRAWN.beside_px)
         others = [regions.placed(row) for row in here if not is_leaf[row]]
-        is_open[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
-    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), is_open)
+        hiding[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
+    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), hiding)
 
 
 def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:

@@ -116,13 +116,13 @@ def paint_view(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: int)
     """(H, W), at full size, the instance whose surface each pixel of a view shows, 0 = none. Surfaces that are not
     credible show and hide nothing."""
     width, height = cameras.sizes[view].tolist()
-    camera, images = cameras[[view]].to("cpu"), np.zeros((height, width), np.int64)
+    camera, canvas = cameras[[view]].to("cpu"), np.zeros((height, width), np.int64)
     credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
     names, parts = list(credible), list(credible.values())
     for index in np.argsort(_depths(parts, camera)[0], kind="stable")[::-1].tolist():  # the farthest first
         part = parts[index].project_parts(camera)[0]
-        part.cut(images)[part.pixels.numpy()] = names[index]
-    return images
+        part.cut(canvas)[part.pixels.numpy()] = names[index]
+    return canvas
 
 
 def _columns(crops: Sequence[Crop], size: tuple[int, int], step: int) -> csc_array:

@@ -56,8 +56,8 @@ def snap_masks(
         rows = (regions.view_index == view).nonzero()[:, 0].tolist()
         taken = np.zeros(photo.shape[:2], bool)
         for row in rows:
-            colors = crops[row].cut(taken)
-            colors |= crops[row].pixels.numpy()
+            covered = crops[row].cut(taken)
+            covered |= crops[row].pixels.numpy()
         for row in (row for row in rows if moves[row]):
             part = missing[row] if missing else None
             whole = crops[row] if part is None else crops[row].union(part)
@@ -65,15 +65,15 @@ def snap_masks(
             x1, y1 = (max(0, low - room) for low in whole.box[:2])
             x2, y2 = (min(size, high + room) for size, high in zip(photo.shape[1::-1], whole.box[2:], strict=True))
             around = whole.within((x1, y1, x2, y2))
-            mask, colors = crops[row].within(around.box).pixels.numpy(), around.cut(taken)
-            others = colors & ~mask
+            mask, covered = crops[row].within(around.box).pixels.numpy(), around.cut(taken)
+            others = covered & ~mask
             likely = mask if part is None else around.pixels.numpy() & ~others
             asked = mask, around.cut(photo), others, likely
             digest = hashlib.sha256(b"".join(f"{each.shape}".encode() + each.tobytes() for each in asked)).hexdigest()
             if digest not in cache:
                 cache[digest] = snap(mask, asked[1], others=others, likely=likely)
             snapped = cache[digest]
-            colors |= snapped
+            covered |= snapped
             crops[row] = Crop.of(snapped, (x1, y1))
     return replace_crops(masks, crops)
 
@@ -95,13 +95,13 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools, likely: Bools | None = No
     whole = mask if likely is None else likely
     scale = min(1.0, SNAP.most_px / max(math.sqrt(whole.sum()), 1.0))
     size = max(1, round(width * scale)), max(1, round(height * scale))
-    colors = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
-    label, inside, beside = (
+    small = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+    inner, inside, beside = (
         cv2.resize(each.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for each in (mask, whole, others)
     )
     radius = max(1, round(SNAP.band * math.sqrt(inside.sum())))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
-    deep = label & (cv2.erode(inside.astype(np.uint8), disk, borderValue=1) > 0)
+    deep = inner & (cv2.erode(inside.astype(np.uint8), disk, borderValue=1) > 0)
     far = (cv2.dilate(inside.astype(np.uint8), disk) == 0) | (beside & ~inside)
     if min(deep.sum(), far.sum()) < SNAP.least_pixels:
         return mask
@@ -109,7 +109,7 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools, likely: Bools | None = No
     state[deep], state[far] = cv2.GC_FGD, cv2.GC_BGD
     cv2.setRNGSeed(0)
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(colors, state, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    cv2.grabCut(small, state, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
     leaf = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.float32)
     snapped: Bools = cv2.resize(leaf, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     return snapped & ~others

@@ -197,9 +197,9 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
     if unclear:
         raise InputError(f"{masks}: {unclear[0]}")
-    file = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
+    listed = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
     if jsons:
-        message = f"holds {len(jsons)} JSON files ({file}), none of them named after a photo"
+        message = f"holds {len(jsons)} JSON files ({listed}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
     archive = next((path for path in paths if path.suffix.lower() == ".npz"), None)
     if archive is not None:
@@ -208,4 +208,4 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
     if jpeg is not None:
         raise InputError(f"{jpeg}: is a JPEG, which blurs the numbers of masks: export PNG instead")
     expected = f"masks named {scene.views[0].name}.png or {scene.views[0].name}.json"
-    raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {file}")
+    raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {listed}")

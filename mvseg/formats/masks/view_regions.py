@@ -54,14 +54,14 @@ def stack_views(
             parts = _crop_labels(content, lens, K)
         else:
             parts = _crop_masks(content, lens, K)
-        masks: set[tuple[Box, bytes]] = set()
+        earlier: set[tuple[Box, bytes]] = set()
         for label, box, crop in parts:
             if box is None:
                 num_empty += 1
-            elif (key := (box, np.packbits(crop).tobytes())) in masks:
+            elif (key := (box, np.packbits(crop).tobytes())) in earlier:
                 num_twice += 1
             else:
-                masks.add(key)
+                earlier.add(key)
                 rows.append((view, box, torch.from_numpy(crop.flatten()), label))
     _say_left_out(len(rows), num_empty, num_twice, source=source)
     num_views = num_views or 0 if scene is None else len(scene.views)
@@ -79,11 +79,11 @@ def stack_views(
 
 def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
     """The masks of a label map, by their numbers."""
-    numbers = undistort(labels, lens, K)
-    boxes = label_boxes(numbers)
+    label_map = undistort(labels, lens, K)
+    boxes = label_boxes(label_map)
     for number in sorted(boxes if lens is None else label_boxes(labels)):
         x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 0, 0))
-        yield number, box if number in boxes else None, numbers[y1:y2, x1:x2] == number
+        yield number, box if number in boxes else None, label_map[y1:y2, x1:x2] == number
 
 
 def _crop_masks(

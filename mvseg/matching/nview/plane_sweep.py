@@ -208,11 +208,11 @@ def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
     """
     inner = labels.numpy()[1:-1, 1:-1] >= 0
     height, width = inner.shape
-    corner_x, top, wide, high = cv2.boundingRect(inner.view(np.uint8))
+    left, top, wide, high = cv2.boundingRect(inner.view(np.uint8))
     if not wide:
         return None
-    low = [-torch.inf if first == 0 else float(first) for first in (corner_x, top)]
-    ends = (corner_x + wide, width), (top + high, height)
+    low = [-torch.inf if first == 0 else float(first) for first in (left, top)]
+    ends = (left + wide, width), (top + high, height)
     right, bottom = (torch.inf if end == whole else float(end) for end, whole in ends)
     return low[0], low[1], right, bottom
 
@@ -265,12 +265,12 @@ class _LabelMaps:
         """(P,) smallest and largest inverse depth at which half of the other views may see a region."""
         distance = torch.cdist(self.cameras.centers, self.cameras.centers).max()
         nearest = float(1 / (SWEEP.nearest * distance)) if distance > 0 else 0.0
-        inverse = [index for index, other in enumerate(others.tolist()) if self.boxes[other] is not None]
-        if not inverse:
+        boxed = [index for index, other in enumerate(others.tolist()) if self.boxes[other] is not None]
+        if not boxed:
             nothing = torch.zeros_like(bases[0, :, 0])
             return nothing, nothing
-        boxes = torch.tensor([self.boxes[other] for other in others[inverse].tolist()], device=bases.device)[..., None]
-        base, e = bases[inverse].mT, offsets[inverse].float()[..., None]  # (S, 3, P) and (S, 3, 1)
+        boxes = torch.tensor([self.boxes[other] for other in others[boxed].tolist()], device=bases.device)[..., None]
+        base, e = bases[boxed].mT, offsets[boxed].float()[..., None]  # (S, 3, P) and (S, 3, 1)
         interval = torch.zeros_like(base[:, 0]), torch.full_like(base[:, 0], nearest)
         for side, (axis, sign) in enumerate(((0, 1), (1, 1), (0, -1), (1, -1))):
             edge = boxes[:, side]
@@ -279,7 +279,7 @@ class _LabelMaps:
             interval = _cut(interval, torch.where(is_cut, slope, 0), torch.where(is_cut, start, 1))
         low, high = _cut(interval, e[:, 2], base[:, 2])
         is_any = low < high
-        needed = (len(inverse) + 1) // 2
+        needed = (len(boxed) + 1) // 2
         low = torch.where(is_any, low, torch.inf).sort(0).values[needed - 1]
         return low, torch.where(is_any, high, 0).sort(0, descending=True).values[needed - 1]
 

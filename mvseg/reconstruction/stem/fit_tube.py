@@ -201,12 +201,12 @@ def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats)
     It is drawn as much too large or small as the mask of each view is, by `offsets` (S,) pixels.
     """
     u = tube_places(TUBE.rows)
-    outline = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
-    half = (outline.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * outline.normals
-    px = outline.px.copy()
-    px[:, ENDS] = _tips(outline, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
+    middle = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
+    half = (middle.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * middle.normals
+    px = middle.px.copy()
+    px[:, ENDS] = _tips(middle, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
     ribbon = np.stack([px - half, px, px + half], 2)
-    projection = Projection(ribbon, np.repeat(outline.depth[..., None], 3, 2))
+    projection = Projection(ribbon, np.repeat(middle.depth[..., None], 3, 2))
     drawn = draw_patch(masks, projection, offsets=offsets, is_blurred=False)
     return crop_ious(masks, drawn >= 0.5)
 

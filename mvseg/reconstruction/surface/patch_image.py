@@ -177,11 +177,11 @@ def select_hiding(masks: MaskStack, points: Floats, others: Mapping[int, Floats]
     first = np.clip(np.floor(low), 0, None).astype(int)
     last = np.clip(np.ceil(high), 0, None).astype(int) + 1
     around = zip(masks.others, first.tolist(), last.tolist(), strict=True)
-    images = {int(each) for crop, (x1, y1), (x2, y2) in around for each in np.unique(crop[y1:y2, x1:x2])}
+    ids = {int(each) for crop, (x1, y1), (x2, y2) in around for each in np.unique(crop[y1:y2, x1:x2])}
     near = {}
     for other, grid in others.items():
         image = project_points(masks.px_from_world, grid).px.reshape(len(masks), -1, 2)
-        if other in images or ((image.max(1) >= low).all(1) & (image.min(1) <= high).all(1)).any():
+        if other in ids or ((image.max(1) >= low).all(1) & (image.min(1) <= high).all(1)).any():
             near[other] = grid
     return near
 
@@ -202,7 +202,7 @@ def hiding_pixels(
     """
     hiding = masks.others.copy()
     projection = project_points(masks.px_from_world, points)
-    pixels = {other: project_points(masks.px_from_world, grid) for other, grid in others.items()}
+    images = {other: project_points(masks.px_from_world, grid) for other, grid in others.items()}
     leaves = (masks.inside | (cover_crops(masks, projection) > 0)).astype(np.uint8)
     size = masks.size[::-1]
     for index, crop in enumerate(hiding):
@@ -210,7 +210,7 @@ def hiding_pixels(
         near &= ~masks.inside[index]
         own, own_depth = cKDTree(projection.px[index].reshape(-1, 2)), projection.depth[index].ravel()
         there = {}
-        for other, image in pixels.items():
+        for other, image in images.items():
             px = image.px[index].reshape(-1, 2)
             if (px.max(0) >= 0).all() and (px.min(0) <= size).all():
                 there[other] = cKDTree(px), image.depth[index].ravel()
@@ -222,7 +222,7 @@ def hiding_pixels(
         crop[behind] = 0
         for other, surface in there.items():
             canvas = np.zeros((size[1] * IMAGE.supersampled, size[0] * IMAGE.supersampled), np.uint8)
-            fill_grids([canvas], pixels[other].px[index : index + 1] * IMAGE.supersampled)
+            fill_grids([canvas], images[other].px[index : index + 1] * IMAGE.supersampled)
             drawn = np.argwhere(near & (crop == 0) & (_shares(canvas, size) >= 0.5))
             if len(drawn):
                 crop[tuple(drawn[_gaps(drawn, surface, (own, own_depth)) < -margin].T)] = other
