@@ -1,28 +1,33 @@
-"""Surfaces check the ids: masks that show another instance's surface get its id. Not in the paper.
+"""Surfaces check the ids: the views choose among given masks, as they do among what a detector proposes.
 
 Rays and epipolar lines know nothing of shape. A surface that is fitted to an instance's masks in all views says what
-each view must show of it. So it recognises its masks where they were matched to another instance (`shown_leaves.py`).
-Where two surfaces explain one mask in disjoint parts, it shows two leaves (`find_shared`).
+each view must show of it. So the instances of given masks are candidates, and those that the matcher finds once more
+(`match_again.py`), and `choose` asks which masks show them. Given masks are proposals that surely show some leaf: so
+each keeps its id unless it more likely than not shows another leaf that has no other mask in its view. Where two
+surfaces explain one mask in disjoint parts, it shows two leaves (`find_shared`). Not in the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.ndimage import distance_transform_edt
-from scipy.special import expit
+from torch import Tensor
 
 from mvseg.masks import SURE, Masks, MergedMask
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Ints, paint_view, see
-from mvseg.verification.numbers import AGAIN, PARTS
-from mvseg.verification.shown_leaves import MaskQuestion, ask, settle_masks
+from mvseg.verification.choice import choose
+from mvseg.verification.choose import gather_candidates
+from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, paint_view, see
+from mvseg.verification.leaf_scores import Candidates, show_chances
+from mvseg.verification.match_again import match_again
+from mvseg.verification.numbers import AGAIN, CHOICE, PARTS
 
 
 def check_ids(
@@ -36,9 +41,8 @@ def check_ids(
     """Move masks to the instances whose surfaces they show.
 
     These may be instances that are found among the masks that do not show their own. No mask loses its id without
-    getting another. An instance may have several masks in a view afterwards: they show it together. With fewer than
-    `AGAIN.least_views` views, masks that are surely matched stay. Last, the masks that show two surfaces are marked as
-    merged (`find_shared`).
+    getting another. With fewer than `AGAIN.least_views` views, masks that are surely matched stay. Last, the masks that
+    show two surfaces are marked as merged (`find_shared`).
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
@@ -50,27 +54,88 @@ def check_ids(
         The same masks; those that moved have q as their match score. Instances that lost all their masks leave gaps
         between the ids; new ones have the highest.
     """
-    on_cpu, cameras = masks.to("cpu"), cameras.to("cpu")
-    is_held: Bools = (on_cpu.is_corrected | on_cpu.is_linked).numpy()
+    cameras, given = cameras.to("cpu"), torch.full((len(masks),), CHOICE.given)
+    table = replace(masks.to("cpu"), detection_scores=given)
+    ids = table.instance_ids.numpy()
+    names = np.unique(ids[ids > 0])
+    leaf = np.where(ids > 0, np.searchsorted(names, ids), -1)
+    is_held = table.is_corrected | table.is_linked
     if masks.regions.num_views < AGAIN.least_views:
-        is_held = is_held | (on_cpu.match_scores >= SURE).numpy()
-    question = ask(on_cpu, surfaces, cameras=cameras, config=config, is_held=is_held, cache=cache)
-    leaf, odds = settle_masks(question)
-    names = on_cpu.instance_ids[on_cpu.instance_ids > 0].unique().numpy()
-    num_new = len(question.candidates) - len(names)
-    names = np.concatenate((names, on_cpu.num_instances + 1 + np.arange(num_new), [-1]))
+        is_held = is_held | (table.match_scores >= SURE)
+    candidates, drawn = _gather([table], surfaces, cameras, is_held=is_held)
+    q = show_chances(
+        candidates,
+        see(drawn, len(table), candidates.is_credible),
+        given.double().numpy(),
+        table.resolution.double().numpy(),
+    )
+    own = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), leaf]
+    if more := match_again(table, leaf, q=own, cameras=cameras, config=config):
+        candidates, drawn = _gather([table, *more], surfaces, cameras, is_held=is_held, cache=cache)
+    is_apart = (table.is_linked & (table.instance_ids < 1)).numpy()  # an edit only says which leaf they do not show
+    chosen = choose(candidates, table, drawn=drawn, usable=~is_apart)
+    to = np.append(chosen.candidates, -1)[chosen.leaf]
+    is_moved = find_moves(leaf, to, table.view_index.numpy(), q=chosen.q)
+    leaf = np.where(is_moved, to, leaf)
+    names = np.concatenate((names, table.num_instances + 1 + np.arange(len(candidates) - len(names)), [-1]))
     ids = names[leaf]
-    is_moved = ids != on_cpu.instance_ids.numpy()
-    merged = {each.region: each for each in on_cpu.merged if not is_moved[each.region] and (ids == each.other).any()}
+    merged = {each.region: each for each in table.merged if not is_moved[each.region] and (ids == each.other).any()}
     pairs = {(each.region, each.own, each.other) for each in merged.values()}
-    merged |= {each.region: each for each in find_shared(question, leaf, names, cameras=cameras, pairs=pairs)}
-    scores = torch.from_numpy(np.where(is_moved, expit(odds), on_cpu.match_scores.double().numpy())).float()
-    checked = replace(on_cpu, instance_ids=torch.from_numpy(ids), match_scores=scores).with_merged(merged.values())
-    return replace(checked.to(masks.view_index.device), regions=masks.regions)
+    shared = find_shared(table, candidates, drawn, leaf, names=names, cameras=cameras, pairs=pairs)
+    merged |= {each.region: each for each in shared}
+    scores = torch.from_numpy(np.where(is_moved, chosen.q, table.match_scores.double().numpy())).float()
+    checked = replace(
+        table,
+        instance_ids=torch.from_numpy(ids),
+        match_scores=scores,
+        detection_scores=masks.detection_scores.cpu(),
+    )
+    return replace(checked.with_merged(merged.values()).to(masks.view_index.device), regions=masks.regions)
+
+
+def _gather(
+    tables: Sequence[Masks],
+    surfaces: Mapping[int, LeafSurface],
+    cameras: Cameras,
+    *,
+    is_held: Tensor,
+    cache: SurfaceCache | None = None,
+) -> tuple[Candidates, tuple[Drawn, ...]]:
+    """The instances of the first of these tables, by id, with their surfaces, those of the others, and V views of them
+    all. The tables are of the same D masks with other ids."""
+    rows = torch.arange(len(tables[0]))
+    candidates = gather_candidates(
+        [(each, rows) for each in tables], cameras, table=tables[0], is_held=is_held, surfaces=surfaces, cache=cache
+    )
+    return candidates, draw_views(tables[0].regions, candidates.surfaces, cameras)
+
+
+def find_moves(leaf: Ints, to: Ints, views: Ints, *, q: Floats) -> Bools:
+    """(D,) which masks move: those that show another leaf by `SURE` or more, unless another mask of their view stays
+    with that leaf.
+
+    Args:
+        leaf: (D,) the candidate that each mask was matched to; -1 for none.
+        to: (D,) the candidate that it was chosen for; -1 for none.
+        views: (D,) the view of each.
+        q: (D,) how likely it shows `to`.
+    """
+    is_moved = (to >= 0) & (to != leaf) & (q >= SURE)
+    is_rival = (views[:, None] == views) & (to[:, None] == leaf)
+    while (is_blocked := is_moved & (is_rival & ~is_moved).any(1)).any():
+        is_moved &= ~is_blocked
+    return is_moved
 
 
 def find_shared(
-    question: MaskQuestion, leaf: Ints, names: Ints, *, cameras: Cameras, pairs: Set[tuple[int, int, int]] = frozenset()
+    masks: Masks,
+    candidates: Candidates,
+    drawn: Sequence[Drawn],
+    leaf: Ints,
+    *,
+    names: Ints,
+    cameras: Cameras,
+    pairs: Set[tuple[int, int, int]] = frozenset(),
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 
@@ -79,14 +144,16 @@ def find_shared(
     second part is what is nearer to what is seen of the second surface than to what is seen of the first.
 
     Args:
-        question: of D masks and K candidates.
+        masks: D masks with the ids of the matcher.
+        candidates: K.
+        drawn: V views of both.
         leaf: (D,) the candidate that each mask shows; -1 for none.
         names: (K + 1,) ids of the candidates.
         pairs: (mask, own id, other id) that the matcher named.
     """
-    regions, candidates, every = question.masks.regions, question.candidates, np.arange(len(leaf))
-    is_there = np.isin(np.arange(len(candidates)), leaf) & question.is_known & candidates.is_credible
-    inside = np.where(is_there, see(question.drawn, len(leaf), is_there).inside, 0.0)
+    regions, every, index = masks.regions, np.arange(len(leaf)), np.arange(len(candidates))
+    is_there = np.isin(index, leaf) & np.isin(names[:-1], masks.instance_ids) & candidates.is_credible
+    inside = np.where(is_there, see(drawn, len(leaf), is_there).inside, 0.0)
     inside = np.column_stack((inside, np.zeros(len(leaf))))  # of no candidate
     by_own = inside[every, leaf]
     inside[every, leaf] = 0

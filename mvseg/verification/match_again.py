@@ -11,7 +11,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.special import logit
 
 from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
@@ -23,7 +22,7 @@ from mvseg.verification.evidence import Bools, Floats, Ints
 from mvseg.verification.numbers import AGAIN
 
 
-def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, config: MatchConfig) -> list[Masks]:
+def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config: MatchConfig) -> list[Masks]:
     """The same masks, with the ids of those instances only that masks form which do not show their own.
 
     Such masks are freed, with those matched to nothing. All others stay together as they are, instances stay apart, and
@@ -33,14 +32,14 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
         masks: D masks on the CPU, matched by the method "nview": with any other, or with fewer than `AGAIN.least_views`
             views, nothing is found.
         leaf: (D,) int64, what each mask was matched to, from 0 on; -1 for nothing.
-        odds: (D,) log odds that it shows that.
+        q: (D,) how likely it shows that.
         config: that the masks were matched with.
     """
     matchings: list[Masks] = []
     if config.resolved_method != "nview" or masks.regions.num_views < AGAIN.least_views:
         return matchings
     for least in AGAIN.freed:
-        is_free = (leaf < 0) | (odds < logit(least))
+        is_free = (leaf < 0) | (q < least)
         if (is_free & (leaf >= 0)).any():
             with collect_warnings():  # the first matching has said it
                 again = match_masks(masks, cameras, config, links=_links(leaf, is_free))

@@ -16,7 +16,7 @@ from matched import matched
 from mvseg.masks import Masks, MergedMask
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
-from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.checked_ids import check_ids, find_moves
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 
@@ -224,3 +224,26 @@ def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]
     assert torch.equal(check(regions, ids, {}).instance_ids, ids)
     empty, nothing = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
     assert len(check(empty, nothing, {})) == 0
+
+
+def find_moves_slowly(leaf: list[int], to: list[int], views: list[int], q: list[float]) -> list[bool]:
+    """One mask after another: it stays if the leaf that it shows keeps another mask of its view."""
+    is_moved = [new >= 0 and new != old and chance >= 0.5 for old, new, chance in zip(leaf, to, q, strict=True)]
+    while True:
+        kept = {(views[row], leaf[row]) for row in range(len(leaf)) if not is_moved[row]}
+        stay = [row for row in range(len(leaf)) if is_moved[row] and (views[row], to[row]) in kept]
+        if not stay:
+            return is_moved
+        for row in stay:
+            is_moved[row] = False
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_masks_move_where_no_other_mask_of_the_view_stays(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    leaf, to, views = rng.integers(-1, 5, 40), rng.integers(-1, 5, 40), rng.integers(0, 12, 40)
+    q = rng.uniform(size=40)
+    moves = find_moves(leaf, to, views, q=q)
+    assert moves.tolist() == find_moves_slowly(leaf.tolist(), to.tolist(), views.tolist(), q.tolist())
+    assert moves.any()
+    assert not moves.all()
