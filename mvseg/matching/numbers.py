@@ -116,6 +116,7 @@ class PieceNumbers:
     few_covered: float = 0.02  # chosen: share of a doubted cluster's region for another cluster to take it over
     merged_coverage: float = 0.25  # chosen: share of another cluster's region from which one may share it
     merged_share: float = 0.2  # definition: share of a mask's pixels that each of its two instances explains, at least
+    least_score: float = 0.05  # limit: score of the best region that others are compared with, at least
     neighbours: int = 3  # insensitive: nearest sampled pixels that decide where a merged mask is cut: no id
     # A higher one, and ids of degraded masks lose more than strangers go.
     least: float = 0.3  # insensitive: probability of being a piece below which a mask leaves: -0.005, +0.010
@@ -137,6 +138,7 @@ class NViewNumbers:
     """Reprojection errors that are tried, and when there is no telling."""
 
     dilations: tuple[int, ...] = (1, 2, 4, 8)  # definition: the reprojection errors that are tried, pixels
+    as_good: float = 0.05  # chosen: score below the best one at which a smaller error is as good
     probe_rays: int = 1500  # limit: rays that tell whether a dilation helps, at least about
     # A third more only tries dilations more often.
     explained: float = 0.5  # chosen: mean score of clusters by weights from which no dilation is tried: -0.022, 0

@@ -26,9 +26,11 @@ class VoxelNumbers:
     """Grids of voxels."""
 
     search_cells: int = 24  # limit: cells along the box of an instance, at which the search for it ends
+    shrinks: float = 0.8  # chosen: volume of the box after halving the cells, over that before, that ends the search
     max_cells: int = 100_000  # limit: cells in all, at which it ends
     max_voxels: int = 200_000_000  # limit: voxels of a grid
     crumb: float = 0.02  # chosen: size of a piece below which it is a crumb, as a share of the largest piece's voxels
+    slab: int = 2_000_000  # limit: voxels of a slab that votes are counted in at once
     at_once: int = 8_000_000  # limit: balls and masks that are compared at once
 
 
@@ -60,6 +62,12 @@ class StartNumbers:
 
     most_points: int = 1000  # limit: voxels that are used; enough for nine windows
     num_windows: int = 9  # limit: windows along the leaf, whose middles the midrib of a start goes through
+    window: float = 0.75  # chosen: reach of a window that the directions of the sides come from, in windows
+    fewest: int = 4  # limit: voxels that a window needs; with fewer, the nearest ones stand in
+    nearest: int = 8  # limit: so many of them
+    trimmed: float = 0.005  # chosen: share of the voxels at either end of a leaf that its length leaves out
+    widest: float = 0.93  # chosen: quantile of the distances from the midrib that is half the width
+    smooth: float = 0.3  # chosen: weight of second differences of a start's coefficients
     neighbours: int = 8  # limit: others that a voxel is joined to, where the way along a leaf is looked for
     elongated: float = 2.0  # chosen: ratio of the two largest deviations of a leaf, from which its axis may be a curve
     bent: float = 1.35  # chosen: or of the way along it to the straight one: graphs make detours of a tenth
@@ -82,6 +90,8 @@ class PriorNumbers:
     fold_step_sd: float = 0.2  # chosen: differences of R
     shear_sd: float = 0.15  # chosen: Q along the midrib, and R and S within the blade
     num_pieces: int = 10  # chosen: pieces of the midrib, for sway and speed
+    step: float = 0.02  # limit: distance in u over which the direction of the midrib is a difference
+    pointed: float = 1e-3  # limit: weight of the mean side vector, which stands in at pointed ends
 
 
 @dataclass(frozen=True)
@@ -92,6 +102,7 @@ class FitNumbers:
     """
 
     grid: tuple[int, int] = (36, 9)  # limit: rows and columns of points at which a patch is fitted and measured
+    even: float = 0.3  # chosen: share of even spacing in the places of rows; the rest is denser at both ends
     far_grid: tuple[int, int] = (20, 5)  # limit: the same where it is still far from the masks
     num_steps: int = 7  # limit: steps from a start that is nearly right
     far_reach: float = 14.0  # chosen: pixels within which a sample looks for an edge, at first
@@ -110,9 +121,12 @@ class FitNumbers:
     noisy_view: float = 1.5  # chosen: deviation of a view's distances from which it counts less, in the usual one
     sd_factor: float = 2.0  # chosen: factor of deviations
     difference: float = 1e-4  # limit: move of a coefficient for a derivative, as a share of the spread of all
+    usual_px: float = 0.3  # chosen: median distance of the usual view of a leaf, at least
+    sd_of_median: float = 1.48  # definition: standard deviation of normal errors, in median absolute ones
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     # Where masks are clean, little is measured.
     centre_factor: float = 1.5  # chosen: sd of the common offset of all masks, in the measured one
+    least_free: float = 0.5  # chosen: views beyond two, at least: with two, the offset of all masks is hardly known
     least_centre_sd: float = 0.1  # chosen: the same in pixels, at least
     # Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15.
     least_eigenvalue: float = 1e-10  # limit: least eigenvalue of a scaled normal matrix that is not singular
@@ -233,6 +247,8 @@ class TubeNumbers:
     speed_sd: float = 0.05  # chosen: deviation of the speed along a piece of the axis, in lengths
     taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
     sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
+    usual_px: float = 0.3  # chosen: median distance of the usual view of a leaf, at least
+    sd_of_median: float = 1.48  # definition: standard deviation of normal errors, in median absolute ones
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
     least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count

@@ -201,7 +201,7 @@ def _share_of_masks(
     With `free`, what shows nothing in the same views, it is 0 where not more than `seen_share` of the views whose pixel
     is in the mask or free have it in the mask.
     """
-    slab = max(1, 2_000_000 // (len(axes[1]) * len(axes[2])))
+    slab = max(1, VOXELS.slab // (len(axes[1]) * len(axes[2])))
     parts = []
     for planes in axes[0].split(slab):
         part = [planes, axes[1], axes[2]]
@@ -253,7 +253,7 @@ def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, T
             return None
         low, high = cells.box
         volume = float((high - low).prod())
-        is_fine = float((high - low).max()) >= VOXELS.search_cells * cells.size and volume >= 0.8 * before
+        is_fine = float((high - low).max()) >= VOXELS.search_cells * cells.size and volume >= VOXELS.shrinks * before
         if is_fine or len(cells) >= VOXELS.max_cells:
             break
         before = volume

@@ -148,7 +148,7 @@ def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
 def fit_curve(track: int, trait: str, sizes: tuple[Floats, Floats, Floats]) -> GrowthCurve:
     """The model with the least Akaike criterion through (times, values, sds); robust against single dates."""
     times, values, sds = sizes
-    sds = np.maximum(np.where(np.isfinite(sds), sds, 0.05 * values), GROWTH.least_sd * values)
+    sds = np.maximum(np.where(np.isfinite(sds), sds, GROWTH.guessed_sd * values), GROWTH.least_sd * values)
     fits = [_fit(track, trait, model, (times, values, sds)) for model in CURVES]
     return min(fits, key=lambda fit: fit.criterion)
 
@@ -197,19 +197,21 @@ def _fit(track: int, trait: str, model: str, sizes: tuple[Floats, Floats, Floats
     times, values, sds = sizes
     span, largest, shape = times[-1] - times[0], float(values.max()), CURVES[model]
     count = 1 if model == "constant" else 3
-    steady = largest if model != "expolinear" else max(float(np.ptp(values)), 0.02 * largest) / span
-    least, most = [1e-3 * steady, 0.02 / span, times[0] - 5 * span], [50 * steady, 60 / span, times[-1] + span]
+    steady = largest if model != "expolinear" else max(float(np.ptp(values)), GROWTH.least_growth * largest) / span
+    (smallest, largest_size), (slowest, fastest) = GROWTH.sizes, GROWTH.rates
+    least = [smallest * steady, slowest / span, times[0] - GROWTH.before * span]
+    most = [largest_size * steady, fastest / span, times[-1] + span]
     fits = [
         least_squares(
-            lambda p: (shape(p, times) - values) / sds, (steady, 4 / span, middle)[:count], loss="soft_l1",
-            bounds=(least[:count], most[:count]), x_scale=(steady, 1 / span, span)[:count],
+            lambda p: (shape(p, times) - values) / sds, (steady, GROWTH.first_rate / span, middle)[:count],
+            loss="soft_l1", bounds=(least[:count], most[:count]), x_scale=(steady, 1 / span, span)[:count],
         )
-        for middle in (times[0] - 0.5 * span, times[0] + 0.2 * span)
+        for middle in [times[0] + share * span for share in GROWTH.middles]
     ]  # fmt: skip
     best = min(fits, key=lambda fit: float(fit.cost))
     information, parameters, errors = best.jac.T @ best.jac, np.full(3, np.nan), np.full(3, np.nan)
     parameters[:count] = best.x
-    if np.linalg.cond(information) < 1e14:
+    if np.linalg.cond(information) < GROWTH.most_condition:
         errors[:count] = np.sqrt(np.maximum(np.diag(np.linalg.inv(information)), 0))
     residual = float(np.sqrt(np.mean(np.square((shape(best.x, times) - values) / sds))))
     return GrowthCurve(

@@ -178,7 +178,7 @@ def leaf_features(
     relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
     relative = np.minimum(relative, 0.0)
     fits = log_odds(candidates.fits)
-    columns = np.ones_like(mean_q), mean_q, np.log(number + 0.1), score - clear.score, relative, fits
+    columns = np.ones_like(mean_q), mean_q, np.log(number + CHOICE.some), score - clear.score, relative, fits
     return np.stack(columns, 1), clear
 
 

@@ -53,6 +53,7 @@ class ChoiceNumbers:
     clear: float = 0.6  # chosen: shown share of its expected area from which a candidate is a clear leaf
     # Of 43 scenes, 0.99 changes the ids of three real plants, each by less than 0.016 of ARI, 0.9 those of none.
     given: float = 0.95  # chosen: score of a given mask, as if a detector had found it
+    some: float = 0.1  # definition: number of masks that is added before the logarithm, a feature of P
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
     least_shown: float = 0.2  # chosen: q from which a mask may show a leaf
     least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement

@@ -21,10 +21,10 @@ from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_
 from mvseg.matching.partition import Clusters, members_of
 from mvseg.matching.view_graph import ViewGraph
 
-# chosen: log-odds that two regions show one instance, by epipolar weight: what was counted on degraded masks of
-# development plants, by a command that is gone
+# fitted: python benchmarks/pair_odds.py --cache DIR: log odds that two regions show one instance, by epipolar weight.
+# What it counts today is within 0.5 of these.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
-# chosen: the same
+# fitted: the same
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
 
 Floats = NDArray[np.floating]

@@ -144,7 +144,7 @@ def select_dilation(
     rays = min(rays_per_region(len(cameras)), -(-NVIEW.probe_rays // max(len(regions), 1)))
     for sweep in sweep_dilated(regions, cameras, dilations=NVIEW.dilations[1:], rays=rays):
         explained.append(score(sweep).explained(pairwise))
-    best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
+    best = int(np.argmax(np.array(explained) >= max(explained) - NVIEW.as_good))
     if best == 0:
         return first, NVIEW.dilations[0]
     return score(sweep_planes(regions, cameras, dilation_px=NVIEW.dilations[best])), NVIEW.dilations[best]

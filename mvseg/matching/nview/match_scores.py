@@ -27,6 +27,7 @@ Ints = NDArray[np.int64]
 REGION = {"always": 1.24, "score": 1.20, "margin": 2.96, "coverage": -0.69, "weight": 1.26, "partners": -0.90,
           "few partners": -1.59, "fragments": -0.95}  # fmt: skip
 SCENE = {"always": -2.889, "region": 0.050, "scene": 0.303, "region times scene": 0.173, "agreement": 2.911}
+SCORES, MARGINS = (-0.2, 1.0), (-1.0, 1.5)  # limit: ranges of features on the plants that these were fitted on
 SUREST = 0.999, 0.99  # limit: the most that the first regression says of a region, and of a scene
 
 
@@ -97,8 +98,8 @@ def features(evidence: IdEvidence) -> Floats:
     return np.stack(
         [
             np.ones(len(evidence.score)),
-            np.clip(evidence.score, -0.2, 1),
-            np.clip(evidence.margin, -1, 1.5),
+            np.clip(evidence.score, *SCORES),
+            np.clip(evidence.margin, *MARGINS),
             np.clip(evidence.coverage, 0, 1),
             np.clip(evidence.weight, 0, 1),
             np.minimum(evidence.num_partners / others, 1),

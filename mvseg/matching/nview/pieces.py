@@ -56,7 +56,7 @@ def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Flo
     best = order[is_best][is_best.cumsum() - 1]  # of the place of each
     rows, best = order[~is_best], best[~is_best]
     share = np.log((num_split - 0.5) / max(num_places, 1)) if len(rows) else 0.0
-    ratio = np.clip(own[rows] / np.maximum(own[best], 0.05), 0, 1)
+    ratio = np.clip(own[rows] / np.maximum(own[best], PIECES.least_score), 0, 1)
     coverage = np.clip(scores.coverages(clusters)[clusters.ids[rows], rows], 0, 1) if len(rows) else np.zeros(0)
     partners = np.maximum(scores.graph.sum_partners(np.ones_like(scores.graph.weights), clusters), 1)
     weight = scores.graph.sum_partners(scores.graph.weights, clusters) / partners

@@ -159,7 +159,7 @@ def _covariance(matrix: Floats, equations: _Equations, stack: NDArray, *, centre
     between = inverse @ pulls.T
     growth = inverse @ (jacobian.T @ weight)  # by which everything changes when all masks grow by a pixel
     rms = np.sqrt((weight * px**2).sum() / max(weight.sum(), 1e-12))
-    few = num_views / max(num_views - 2, 0.5)
+    few = num_views / max(num_views - 2, FIT.least_free)
     shared = FIT.centre_factor * few * max(centre_sd, FIT.least_centre_sd)
     fitted = (FIT.sd_factor * max(1.0, rms / FIT.quiet_px)) ** 2 * inverse
     return fitted + between @ between.T + shared**2 * np.outer(growth, growth)
@@ -186,7 +186,7 @@ def _weigh(distances: Distances, masks: MaskStack, offsets: Floats, *, scale_px:
     scale = np.maximum(scale_px, FIT.scale_factor * spread)
     weight = FIT.sample_weight * distances.weight / (1 + (px / scale[leaf]) ** 2)
     weight = weight * _view_weights(px, distances, masks)[distances.stack]
-    noise = np.maximum(1.0, 1.48 * spread / FIT.clean_px)
+    noise = np.maximum(1.0, FIT.sd_of_median * spread / FIT.clean_px)
     return _Equations(distances=distances, px=px, weight=weight, noise=noise)
 
 
@@ -215,7 +215,7 @@ def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
 def _view_weights(px: Floats, distances: Distances, masks: MaskStack) -> Floats:
     """(S,) 1, or less for views whose distances spread more than is usual in the others of the leaf."""
     spreads = np.nan_to_num(per_view(np.abs(px), distances.stack, len(masks)))
-    usual = FIT.noisy_view * np.maximum(per_view(spreads, masks.leaf, distances.num_leaves), 0.3)
+    usual = FIT.noisy_view * np.maximum(per_view(spreads, masks.leaf, distances.num_leaves), FIT.usual_px)
     return np.minimum(1.0, (usual[masks.leaf] / np.maximum(spreads, 1e-9)) ** 2)
 
 

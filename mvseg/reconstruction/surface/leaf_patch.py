@@ -30,7 +30,7 @@ MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) f
 def place_stations(num_rows: int) -> Floats:
     """(num_rows,) places u from 0 to 1, denser at both ends, where the outline is round."""
     t = np.linspace(0, 1, num_rows)
-    return 0.3 * t + 0.35 * (1 - np.cos(np.pi * t))
+    return FIT.even * t + (1 - FIT.even) / 2 * (1 - np.cos(np.pi * t))
 
 
 def spline_basis(u: Floats, count: int) -> Floats:
@@ -205,7 +205,7 @@ def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
     along = _unit(ahead @ coefficients)
     side = sideways @ coefficients[..., SIDE, :]
     # Where the side vector vanishes (pointed ends) the mean one stands in.
-    side = side + 1e-3 * coefficients[..., SIDE, :].mean(-2, keepdims=True)
+    side = side + PRIOR.pointed * coefficients[..., SIDE, :].mean(-2, keepdims=True)
     across = _unit(side - (side * along).sum(-1, keepdims=True) * along)
     (ax, ay, az), (bx, by, bz) = np.moveaxis(along, -1, 0), np.moveaxis(across, -1, 0)
     normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)  # np.cross is slow on few
@@ -216,9 +216,10 @@ def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
 @cache
 def _frame_rows() -> tuple[Floats, Floats]:
     """(sum of `_frame_counts`, 26) rows of directions along the midrib, and (same, 12) of the side vectors."""
-    middle = np.clip(np.concatenate([np.linspace(0, 1, count) for count in _frame_counts()]), 0.02, 0.98)
+    places = np.concatenate([np.linspace(0, 1, count) for count in _frame_counts()])
+    middle = np.clip(places, PRIOR.step, 1 - PRIOR.step)
     zeros = np.zeros_like(middle)
-    ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
+    ahead = patch_basis(middle + PRIOR.step, zeros) - patch_basis(middle - PRIOR.step, zeros)
     return ahead, spline_basis(middle, COUNTS[1])
 
 

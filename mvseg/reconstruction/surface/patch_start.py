@@ -58,7 +58,7 @@ def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
     `side` (3,) is roughly where v of the first points to: along the largest spread across; the others are turned about
     the midrib.
     """
-    low, high = np.quantile(place, [0.005, 0.995])
+    low, high = np.quantile(place, [STARTS.trimmed, 1 - STARTS.trimmed])
     t = np.clip((place - low) / max(high - low, 1e-12), 0, 1)
     middles, sides = _windows(points, t, side)
     return [_coefficients(middles, each) for each in sides]
@@ -102,9 +102,9 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
     """Centroids (9, 3) of overlapping windows along t in [0, 1], and half-width vectors (4, 9, 3) in all directions."""
     centres = (np.arange(STARTS.num_windows) + 0.5) / STARTS.num_windows
     weights = np.clip(1 - np.abs(t - centres[:, None]) * STARTS.num_windows, 0, None)
-    for index in np.flatnonzero((weights > 0).sum(1) < 4):  # a gap in the cloud: the nearest points
+    for index in np.flatnonzero((weights > 0).sum(1) < STARTS.fewest):  # a gap in the cloud: the nearest points
         weights[index] = 0
-        weights[index, np.argsort(np.abs(t - centres[index]), kind="stable")[:8]] = 1
+        weights[index, np.argsort(np.abs(t - centres[index]), kind="stable")[: STARTS.nearest]] = 1
     middles = weights @ points / weights.sum(1, keepdims=True)
     along = np.gradient(middles, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -112,8 +112,8 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
     thinnest = STARTS.thinnest / 2 * float(np.linalg.norm(np.diff(middles, axis=0), axis=1).sum())
     directions, sides = np.zeros((STARTS.num_windows, 3)), np.zeros((len(turns), STARTS.num_windows, 3))
     for index in np.argsort(np.abs(centres - 0.5), kind="stable"):
-        near = np.abs(t - centres[index]) < 0.75 / STARTS.num_windows
-        flat = points[near] - middles[index] if near.sum() >= 4 else points - middles[index]
+        near = np.abs(t - centres[index]) < STARTS.window / STARTS.num_windows
+        flat = points[near] - middles[index] if near.sum() >= STARTS.fewest else points - middles[index]
         flat = flat - (flat @ along[index])[:, None] * along[index]
         widest = np.linalg.eigh(flat.T @ flat)[1][:, 2]
         # Windows next to the middle one come first: each takes the sign of the nearest window that has a direction.
@@ -121,7 +121,7 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
         before = directions[done[np.abs(done - index).argmin()]] if len(done) else side
         directions[index] = widest * (1.0 if widest @ before >= 0 else -1.0)
         turned = np.cos(turns) * directions[index] + np.sin(turns) * np.cross(along[index], directions[index])
-        half_widths = np.maximum(np.quantile(np.abs(flat @ turned.T), 0.93, axis=0), thinnest)
+        half_widths = np.maximum(np.quantile(np.abs(flat @ turned.T), STARTS.widest, axis=0), thinnest)
         sides[:, index] = half_widths[:, None] * turned
     return middles, sides
 
@@ -149,5 +149,5 @@ def _smooth_fit(u: Floats, values: Floats, count: int) -> Floats:
 def _smoother(places: bytes, count: int) -> Floats:
     """(count, P) from values at the places u (P,) to the coefficients of `_smooth_fit`."""
     u = np.frombuffer(places)
-    rows = np.concatenate([spline_basis(u, count), 0.3 * np.diff(np.eye(count), 2, axis=0)])
+    rows = np.concatenate([spline_basis(u, count), STARTS.smooth * np.diff(np.eye(count), 2, axis=0)])
     return np.linalg.pinv(rows)[:, : len(u)]
