@@ -28,7 +28,7 @@ from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_regions
@@ -63,7 +63,7 @@ def list_masks(args: argparse.Namespace) -> Iterator[Given]:
             for view, size in zip(scene.views, sizes, strict=True)
         ]
         word = folder.parent.name if folder.parent.name.endswith("-series") else folder.name
-        yield Given(folder.name, word.split("-")[0], regions, shown_instances(regions, maps), scene.cameras)
+        yield Given(folder.name, word.split("-")[0], regions, true_instances(regions, maps), scene.cameras)
     for kind in args.masks:
         if kind != "pieces":
             for spec in chosen_scenes(args):
@@ -78,7 +78,7 @@ def list_masks(args: argparse.Namespace) -> Iterator[Given]:
                 cameras = strap_cameras(plant)
                 true = visible_ids(plant, cameras)
                 regions = regions_from_label_maps([cut_pieces(labels) for labels in true])
-                leaf = shown_instances(regions, list(true), count_background=False)
+                leaf = true_instances(regions, list(true), count_background=False)
                 name = f"pieces {num_leaves}x{len(cameras)} {number}"
                 yield Given(name, name, regions, leaf, cameras)
 

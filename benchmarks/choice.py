@@ -157,7 +157,7 @@ def fit(studies: list[Study]) -> LeafScores:
             shows=regress(FITTED.shows, np.concatenate(shows[0]), np.concatenate(shows[1])),
             matched=regress(FITTED.matched, np.concatenate(matched[0]), np.concatenate(matched[1])),
             leaf=regress(FITTED.leaf, np.array(leaves[True][0]), np.array(leaves[True][1])),
-            found=regress(FITTED.found, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
+            leaf_matched=regress(FITTED.leaf_matched, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
             finer=FITTED.finer,
         )
     return fitted

@@ -37,7 +37,7 @@ from benchmarks.camera_faults import FAULTS, faulty_cameras
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_detected, load_maps
 from mvseg.errors import collect_warnings
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.findings.sentences import DISAGREEMENT
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
@@ -93,7 +93,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> 
     for number, kind in enumerate(KINDS):
         if kind == "detected":
             regions = load_detected(spec, cache)
-            truth = shown_instances(regions, list(scene.true))
+            truth = true_instances(regions, list(scene.true))
         else:
             regions, truth = scene.masks(kind)
         rng = np.random.default_rng([spec.seed, spec.num_views, number])

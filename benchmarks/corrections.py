@@ -25,8 +25,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.choice import true_maps
 from benchmarks.simulated_person import Labels, Look, choose_answers, list_answers
 from mvseg.config import RunConfig
-from mvseg.corrections.doubtful import list_doubts
 from mvseg.corrections.file import Corrections, Edit
+from mvseg.corrections.mask_questions import list_mask_questions
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
@@ -97,7 +97,7 @@ def correct(case: Case) -> tuple[list[tuple[int, float, float]], int]:
     while True:
         result = compute(case, Corrections(edits))
         masks = result.masks.to("cpu")
-        doubts = list_doubts(masks, result.surfaces, cameras=result.scene.cameras, rejected=result.rejected)
+        doubts = list_mask_questions(masks, result.surfaces, cameras=result.scene.cameras, rejected=result.rejected)
         look = Look(masks, case.truth, result.scene, doubts)
         whole = leaf_metrics(masks.regions, masks.instance_ids, case.truth)
         rounds.append((len(done), whole.mv_pq, whole.num_right / max(whole.num_right + whole.num_missed, 1)))

@@ -43,7 +43,7 @@ from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import Annotations, annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import leaf_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
@@ -173,7 +173,7 @@ def count_found(masks: Masks, truth: SceneTruth) -> dict[str, float]:
     """Numbers of true regions and of detections, and how right the ids of those detections are that find a leaf."""
     credited = credit_masks(masks.regions, masks.detection_scores, truth.maps)
     right, found = credited > 0, is_found(truth.regions, masks.regions, credited)
-    is_ignored = (shown_instances(masks.regions, truth.maps) == IGNORE_LABEL) & ~right
+    is_ignored = (true_instances(masks.regions, truth.maps) == IGNORE_LABEL) & ~right
     ids = matching_metrics(masks.instance_ids[right], credited[right])
     leaves = leaf_metrics(masks.regions, masks.instance_ids, truth.maps)
     return {

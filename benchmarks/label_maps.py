@@ -19,7 +19,7 @@ from benchmarks.faults import Faults, degrade_labels
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.image_file import read_rgb
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -50,7 +50,7 @@ class LabelledScene:
     def masks(self, kind: str) -> tuple[Regions, Tensor]:
         """The D regions of one of `KINDS`, and (D,) int64, the leaf that each of them shows."""
         regions = regions_from_label_maps(list(self.true if kind == "true" else self.degraded))
-        return regions, shown_instances(regions, list(self.true), count_background=False)
+        return regions, true_instances(regions, list(self.true), count_background=False)
 
 
 def load_maps(spec: SceneSpec, cache: Path) -> LabelledScene:

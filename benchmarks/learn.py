@@ -37,7 +37,7 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import find_in_photos, plant_of_pass, run_pass
@@ -99,7 +99,7 @@ def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
     figures, area = leaf_metrics(masks.regions, masks.instance_ids, truth), 100 * plant.agreed_area
     chances = torch.tensor([0.0, *(plant.instances.probabilities[n] for n in range(1, masks.num_instances + 1))])
     expected = float((chances[masks.instance_ids.clamp(min=0)] * masks.match_scores).sum())
-    of_mask = shown_instances(masks.regions, truth, count_background=False)
+    of_mask = true_instances(masks.regions, truth, count_background=False)
     tubes = tube_evidence(masks.regions, masks.instance_ids, opened.scene.cameras, surfaces=plant.instances.starts)
     stems = [leaf for leaf, each in tubes.items() if each.probability > SURELY_STEM
              and not bool((of_mask[masks.instance_ids == leaf] > 0).any())]  # fmt: skip

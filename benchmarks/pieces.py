@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import load_maps, visible_ids
 from benchmarks.straps import cut_pieces, strap_cameras
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.match_nview import find_clusters
 from mvseg.matching.nview.pieces import PIECE, piece_features
@@ -51,7 +51,7 @@ def list_kinds(cache: Path) -> Iterator[tuple[str, Regions, torch.Tensor, Camera
             faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
             for maps in (list(true), pieces, faulty):
                 regions = regions_from_label_maps(maps)
-                leaf = shown_instances(regions, list(true), count_background=False)
+                leaf = true_instances(regions, list(true), count_background=False)
                 yield f"strap {num_leaves} {number}", regions, leaf, cameras
     for spec in list_specs(PRESETS["paper-eval"], 0):
         is_asked = spec.num_leaves in LEAVES and spec.num_views in VIEWS and plant_index(spec) < PLANTS

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.corrections.doubtful import Doubt
 from mvseg.corrections.file import Confirm, Edit, Link, Outline, Reject, Split
+from mvseg.corrections.mask_questions import MaskQuestion
 from mvseg.evaluation.panoptic import RIGHT_IOU
-from mvseg.evaluation.truth import region_crops, shown_instances
+from mvseg.evaluation.truth import region_crops, true_instances
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.regions import IGNORE_LABEL
@@ -64,7 +64,7 @@ class Look:
         iou: {leaf: IoU with its home over all views}.
     """
 
-    def __init__(self, masks: Masks, truth: Sequence[Labels], scene: Scene, doubts: Sequence[Doubt]) -> None:
+    def __init__(self, masks: Masks, truth: Sequence[Labels], scene: Scene, doubts: Sequence[MaskQuestion]) -> None:
         self.masks, self.truth, self.scene = masks, truth, scene
         count = 1 + max(int(labels[labels != IGNORE_LABEL].max(initial=0)) for labels in truth)
         self.visible = np.stack([np.bincount(labels.ravel(), minlength=IGNORE_LABEL + 1)[:count] for labels in truth])
@@ -73,7 +73,7 @@ class Look:
         self.shares = np.zeros((len(masks), count), np.int64)  # pixels of each leaf under each mask; 0: of none
         for row, (labels, mask) in enumerate(region_crops(masks.regions, truth)):
             self.shares[row] = np.bincount(labels[mask], minlength=IGNORE_LABEL + 1)[:count]
-        self.leaf = shown_instances(masks.regions, truth).numpy()
+        self.leaf = true_instances(masks.regions, truth).numpy()
         self.ids, self.views = masks.instance_ids.numpy(), masks.view_index.numpy()
         self.doubts = doubts
         self._find_homes()
@@ -151,7 +151,7 @@ class Look:
         polygon = tuple((float(x), float(y)) for x, y in self._to_photo(view, outline))
         return Outline(view=self.scene.views[view].name, polygon=polygon, leaf=word)
 
-    def point(self, doubt: Doubt) -> tuple[float, float]:
+    def point(self, doubt: MaskQuestion) -> tuple[float, float]:
         """Where a question points at."""
         return self.middle(doubt.view, doubt.outlines[0][1]) if doubt.outlines else self.place(doubt.region)[1:]
 
@@ -194,7 +194,7 @@ def _said(look: Look, edits: Sequence[Edit]) -> list[tuple[int, int, int]]:
     return found
 
 
-def _is_answered(look: Look, doubt: Doubt, said: Sequence[tuple[int, int, int]]) -> bool:
+def _is_answered(look: Look, doubt: MaskQuestion, said: Sequence[tuple[int, int, int]]) -> bool:
     for view, outline in doubt.outlines:
         inside = look.inside(view, outline)
         if any(where == view and inside[row, column] for where, column, row in said):
@@ -209,7 +209,7 @@ def _is_answered(look: Look, doubt: Doubt, said: Sequence[tuple[int, int, int]])
     )
 
 
-def _answer_mask(look: Look, doubt: Doubt) -> tuple[tuple[Edit, ...], set[int]]:
+def _answer_mask(look: Look, doubt: MaskQuestion) -> tuple[tuple[Edit, ...], set[int]]:
     """Of a question about a mask."""
     leaf, view = int(look.leaf[doubt.region]), look.place(doubt.region)
     owner, is_few = look.owner.get(doubt.instance, 0), doubt.kind == "few"
@@ -228,7 +228,7 @@ def _answer_mask(look: Look, doubt: Doubt) -> tuple[tuple[Edit, ...], set[int]]:
     return (edit,), {leaf, other}
 
 
-def _answer_outlines(look: Look, doubt: Doubt) -> tuple[tuple[Edit, ...], set[int]]:
+def _answer_outlines(look: Look, doubt: MaskQuestion) -> tuple[tuple[Edit, ...], set[int]]:
     """Of a question about what has no mask: a leaf that should be there, or a candidate."""
     shown = [_leaf_inside(look, view, outline) for view, outline in doubt.outlines]
     view, outline = doubt.outlines[0]

@@ -30,7 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import KINDS, MIN_PIXELS, load_maps
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
 from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -167,7 +167,7 @@ def collect_evidence(num_plants: int) -> list[dict[str, Any]]:
             faulty = [degrade_labels(each, Faults(), seed=100 * seed + view) for view, each in enumerate(true)]
             for kind, maps in zip(KINDS, (true, faulty), strict=True):
                 regions = regions_from_label_maps(maps)
-                ids = shown_instances(regions, true, count_background=False)
+                ids = true_instances(regions, true, count_background=False)
                 ids = torch.where(ids > 0, ids, -1)
                 surfaces = fit_surfaces(regions, ids, cameras, is_rough=True)
                 for instance, found in tube_evidence(regions, ids, cameras, surfaces=surfaces).items():

@@ -23,7 +23,7 @@ from benchmarks.confidence import has_right_id
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import MIN_PIXELS, visible_ids
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.matching.match import match_regions
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
@@ -69,7 +69,7 @@ def main() -> None:
             faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
             for kind, maps in (("whole", list(true)), ("pieces", pieces), ("degraded", faulty)):
                 regions = regions_from_label_maps(maps)
-                leaf = shown_instances(regions, list(true), count_background=False)
+                leaf = true_instances(regions, list(true), count_background=False)
                 ids = match_regions(regions, cameras).instance_ids
                 metrics = matching_metrics(ids, leaf)
                 is_wrong = ~torch.from_numpy(has_right_id(ids.numpy(), leaf.numpy()))

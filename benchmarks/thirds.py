@@ -48,7 +48,7 @@ from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.config import RunConfig
-from mvseg.corrections.as_seen import name_each
+from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -284,7 +284,7 @@ def draw(case: Case, first: Masks, number: int) -> Masks:
 def count_changed(before: Masks, after: Masks) -> int:
     """The masks of one that the other has not, with the same pixels and in the same instance."""
     one, other = (
-        dict(zip(name_each(each.regions), each.instance_ids.tolist(), strict=True)) for each in (before, after)
+        dict(zip(name_regions(each.regions), each.instance_ids.tolist(), strict=True)) for each in (before, after)
     )
     both = one.keys() & other.keys()
     votes = np.zeros((before.num_instances + 1, after.num_instances + 1))

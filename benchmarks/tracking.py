@@ -60,7 +60,7 @@ from mvseg.simulation.series import (
 )
 from mvseg.tracking.dates import Number, PlantOnDate, SeenLeaf, read_date, see_surface
 from mvseg.tracking.leaves import DateLeaves, leaves_of
-from mvseg.tracking.numbers import SIGHTS
+from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.track import Tracks, track_leaves
 from mvseg.traits.measure import measure_plant
 
@@ -87,7 +87,7 @@ def see_plant(
         if rng.random() < missed:
             continue
         off, sd = rng.normal(0, 0.03 * noise * leaf.length, (2, 3)), 0.03 * noise * leaf.length
-        share = np.linspace(0, 1, SIGHTS.stations)[:, None]
+        share = np.linspace(0, 1, OBSERVATIONS.stations)[:, None]
         clear = see_surface(0, leaf.vertices, BLADE_COLUMNS, {}, is_oriented=True)
         assert clear.midrib is not None
         assert clear.points is not None

@@ -19,7 +19,7 @@ from mvseg import demo
 from mvseg.checks import photo_matches
 from mvseg.checks.photo_matches import PhotoMatches, find_photo_features, match_pair
 from mvseg.cli import command
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.poses.sift import Sift
@@ -99,7 +99,7 @@ def true_ids(scene: Scene, regions: Regions, truth: Path) -> torch.Tensor:
     """(D,) true leaf of each region, from a folder of label PNGs."""
     sizes = scene.cameras.sizes.tolist()
     maps = [read_label_png(truth / f"{view.name}.png", *size) for view, size in zip(scene.views, sizes, strict=True)]
-    return shown_instances(regions, maps)
+    return true_instances(regions, maps)
 
 
 @pytest.fixture(scope="session")

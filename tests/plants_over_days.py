@@ -20,7 +20,7 @@ from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
 from mvseg.scene import Cameras, Scene, View
 from mvseg.tracking.dates import Floats, Number, PlantOnDate, SeenLeaf, resample
-from mvseg.tracking.numbers import SIGHTS
+from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.track import Tracks
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
@@ -37,10 +37,10 @@ def grow_blades(count: int, seed: int) -> Blades:
         azimuth = 2.4 * leaf + rng.normal(0, 0.3)
         out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
         side = np.array([-out[1], out[0], 0.0])
-        along = np.linspace(0, 1, SIGHTS.rows)[:, None] * rng.uniform(50, 110)
+        along = np.linspace(0, 1, OBSERVATIONS.rows)[:, None] * rng.uniform(50, 110)
         rise, droop = rng.uniform(0.2, 0.9), rng.uniform(0.002, 0.008)
         line = (0.0, 0.0, 22.0 * leaf) + 6 * out + along * out + (rise * along - droop * along**2) * (0, 0, 1)
-        half = 14 * np.sin(np.pi * np.linspace(0.02, 0.98, SIGHTS.rows))[:, None]
+        half = 14 * np.sin(np.pi * np.linspace(0.02, 0.98, OBSERVATIONS.rows))[:, None]
         blades[leaf] = np.stack([line - half * side, line, line + half * side], 1)
     return blades
 
@@ -78,7 +78,7 @@ def see(
     leaves = []
     for number, leaf in enumerate(order, start=1):
         points = pot.apply(blades[leaf].reshape(-1, 3)) + shift
-        grid = points.reshape(SIGHTS.rows, 3, 3)
+        grid = points.reshape(OBSERVATIONS.rows, 3, 3)
         line = resample(grid[:, 1])
         normal = np.cross(grid[1:, :-1] - grid[:-1, 1:], grid[1:, 1:] - grid[:-1, :-1]).sum((0, 1))
         length = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum())

@@ -24,10 +24,10 @@ import torch
 from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
-from mvseg.corrections.as_seen import name_each
 from mvseg.corrections.file import FORMAT, Corrections, Outline, Reject, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
+from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
@@ -226,7 +226,7 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
     assert outcomes == [""]
     one, other = (  # the page keeps the numbers that the result has had
-        {tuple(sorted(name_each(masks.regions.select(masks.instance_ids == leaf)))) for leaf in (1, 2, 3)}
+        {tuple(sorted(name_regions(masks.regions.select(masks.instance_ids == leaf)))) for leaf in (1, 2, 3)}
         for masks in (shown.masks, run.masks)
     )
     assert one == other
@@ -254,7 +254,7 @@ def surfaces_by_masks(result: Result) -> dict[tuple[str, ...], bytes]:
     """{names of a leaf's masks: its surface}: the page keeps the numbers that the result has had."""
     masks, surfaces = result.masks, result.surfaces or {}
     return {
-        tuple(sorted(name_each(masks.regions.select(masks.instance_ids == leaf)))): b"".join(
+        tuple(sorted(name_regions(masks.regions.select(masks.instance_ids == leaf)))): b"".join(
             each.numpy().tobytes() for each in (surface.coefficients, surface.covariance, surface.iou)
         )
         for leaf, surface in surfaces.items()
@@ -378,7 +378,7 @@ def test_the_newest_edits_win(folder: Path) -> None:
     corrector.opened.recompute = recompute  # type: ignore[method-assign]
     corrector.compute()
     assert seen == [0, 3]
-    assert corrector.shown.problem == "stop"
+    assert corrector.page_state.problem == "stop"
     (folder / "corrections.json").unlink()
 
 

@@ -15,7 +15,7 @@ from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import visible_ids
 from conftest import true_ids
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_regions
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -65,7 +65,7 @@ def test_surfaces_never_harm_ids_of_simulated_plants(family: str, seed: int) -> 
     true = visible_ids(plant, cameras)
     faults = Faults(missed=0.1, split=0.1, merged=0.1)
     regions = regions_from_label_maps([degrade_labels(ids, faults, seed=view) for view, ids in enumerate(true)])
-    truth = shown_instances(regions, list(true), count_background=False)
+    truth = true_instances(regions, list(true), count_background=False)
     found, alone = (matching_metrics(ids, truth).ari for ids in ids_with_and_without(cameras, regions))
     assert found >= alone
 

@@ -32,7 +32,7 @@ from mvseg import (
     shape_distance,
     split_merged,
 )
-from mvseg.corrections.doubtful import list_doubts
+from mvseg.corrections.mask_questions import list_mask_questions
 from mvseg.formats.photos import Photos
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
@@ -105,7 +105,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
         lambda r, c, i: choose_leaves(found := detected(r, i), found, cameras=c).masks.instance_ids, False
     ),
     "snap_masks": (lambda r, c, i: snap_masks(detected(r, i), grey_photos(c)).instance_ids, False),
-    "list_doubts": (lambda r, c, i: len(list_doubts(masks_of(r, i), surfaces(), cameras=c)), False),
+    "list_mask_questions": (lambda r, c, i: len(list_mask_questions(masks_of(r, i), surfaces(), cameras=c)), False),
     "matching_metrics": (lambda r, c, i: matching_metrics(i, i).ari, False),
     "shape_distance": (lambda r, c, i: shape_distance(c.t, c.t), False),
     "check_scene": (lambda r, c, i: len(check_scene(scene_there(c), r, features=False).findings), False),
@@ -135,7 +135,7 @@ def test_the_answer_is_the_same_there(name: str) -> None:
 
 
 def test_every_public_name_is_looked_at() -> None:
-    inner = {"match_masks", "check_ids", "choose_leaves", "snap_masks", "list_doubts"}  # of stages, not public
+    inner = {"match_masks", "check_ids", "choose_leaves", "snap_masks", "list_mask_questions"}  # of stages, not public
     assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
 
 

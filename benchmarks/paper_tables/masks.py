@@ -13,7 +13,7 @@ from benchmarks.faults import Faults, degrade_labels
 from benchmarks.found_leaves import tied_instances
 from benchmarks.paper_tables.cells import Cell
 from mvseg.detection.config import DetectConfig
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
@@ -80,7 +80,7 @@ def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detecto
 
 def most_shown(regions: Regions, truth: Sequence[np.ndarray]) -> Tensor:
     """(D,) int64: the leaf that each region shows most of, 0 when it shows none or mostly ignored pixels."""
-    shown = shown_instances(regions, truth, count_background=False)
+    shown = true_instances(regions, truth, count_background=False)
     return torch.where(shown == IGNORE_LABEL, 0, shown)
 
 

@@ -30,7 +30,7 @@ class BatchCounts:
     warnings."""
 
     done: int
-    kept: int
+    resumed: int
     failed: int
     warned: int
 
@@ -83,7 +83,7 @@ def run_batch(
     done = [status for _, status in rows if status.state == "done"]
     return BatchCounts(
         done=len(done),
-        kept=sum(each.is_kept for each in finished.values()),
+        resumed=sum(each.is_kept for each in finished.values()),
         failed=len(rows) - len(done),
         warned=sum(bool(status.warnings) for status in done),
     )

@@ -45,6 +45,6 @@ def run(args: Namespace) -> int:
         say(f"mvseg: warning: {some}, see {tables / 'summary.csv'}", to_stderr=True)
     if counts.failed:
         say(f"mvseg: {counts.failed} of {total} scenes failed, see {tables / 'failures.csv'}", to_stderr=True)
-    kept = f" ({counts.kept} of them before)" if counts.kept else ""
+    kept = f" ({counts.resumed} of them before)" if counts.resumed else ""
     say(f"{out}: {counts.done} of {total} scenes are done{kept}")
     return SOME_FAILED if counts.failed else 0

@@ -24,7 +24,7 @@ def run(args: Namespace) -> int:
     from mvseg.evaluation.agreement import compare_annotators
     from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.evaluation.panoptic import leaf_metrics
-    from mvseg.evaluation.truth import shown_instances
+    from mvseg.evaluation.truth import true_instances
     from mvseg.regions import IGNORE_LABEL
     from mvseg.results.earlier import check_file
     from mvseg.results.read import find_result, read_instances
@@ -35,7 +35,7 @@ def run(args: Namespace) -> int:
         say(f"mvseg: {result}: the only result in {args.result}", to_stderr=True)
     check_file(result / "metrics.json", b'"s_match"')
     regions, truth = read_instances(result, args.truth)
-    ids, true = regions.labels, shown_instances(regions, truth)
+    ids, true = regions.labels, true_instances(regions, truth)
     is_scored = (true != 0) & (true != IGNORE_LABEL)
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}

@@ -10,7 +10,7 @@ from jsonargparse import ArgumentParser, Namespace
 from mvseg.cli.options import CheckedConfig, add_shared, build_options, read_up
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
-from mvseg.poses.config import Known, PoseConfig
+from mvseg.poses.config import PoseConfig, WorldFacts
 
 
 def add_options(parser: ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    world = Known(
+    world = WorldFacts(
         board=args.board if args.board is None else BoardConfig(**vars(args.board)),
         marker=args.marker,
         distance=_read_distance(args.distance),
@@ -66,7 +66,7 @@ def run(args: Namespace) -> int:
     return 0
 
 
-def _run_turntable(args: Namespace, world: Known, config: PoseConfig) -> None:
+def _run_turntable(args: Namespace, world: WorldFacts, config: PoseConfig) -> None:
     from mvseg.runs.pose_turntable import pose_board_photos, pose_turntable_photos
 
     is_board = args.turntable == "board"

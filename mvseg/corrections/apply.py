@@ -168,7 +168,7 @@ def _apply_one(edited: _Edited, number: int, edit: Edit, scene: Scene) -> _Edite
     if isinstance(edit, Reject):
         return _reject(edited, number, edit, scene)
     if isinstance(edit, Confirm):
-        edited, mask = _kept_mask_at(edited, number, (edit.view, *edit.at), scene)
+        edited, mask = _remaining_mask_at(edited, number, (edit.view, *edit.at), scene)
         origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
         edited = edited.with_edit(number, {mask.key}, origin=origin)
         about = (_About(number, mask.key, False),) if edit.everywhere else ()
@@ -217,7 +217,7 @@ def _reject(edited: _Edited, number: int, edit: Reject, scene: Scene) -> _Edited
 
 
 def _split(edited: _Edited, number: int, edit: Split, scene: Scene) -> _Edited:
-    edited, mask = _kept_mask_at(edited, number, (edit.view, *edit.at), scene)
+    edited, mask = _remaining_mask_at(edited, number, (edit.view, *edit.at), scene)
     line = _to_pinhole(scene, mask.view, edit.line)
     if np.ptp(line, axis=0).max() < 1:
         raise _Lost("its line is a point")
@@ -237,7 +237,7 @@ def _split(edited: _Edited, number: int, edit: Split, scene: Scene) -> _Edited:
 def _link(edited: _Edited, number: int, edit: Link, scene: Scene) -> _Edited:
     keys_at = []
     for place in edit.at:
-        edited, mask = _kept_mask_at(edited, number, place, scene)
+        edited, mask = _remaining_mask_at(edited, number, place, scene)
         keys_at.append(mask.key)
     keys = list(dict.fromkeys(keys_at))
     if edit.op == "same":
@@ -339,7 +339,7 @@ def _mask_at(edited: _Edited, place: Place, scene: Scene) -> EditedMask:
     return min(here, key=lambda mask: (edited.is_rejected(mask), mask.origin != Origin.CORRECTED, mask.crop.area))
 
 
-def _kept_mask_at(edited: _Edited, number: int, place: Place, scene: Scene) -> tuple[_Edited, EditedMask]:
+def _remaining_mask_at(edited: _Edited, number: int, place: Place, scene: Scene) -> tuple[_Edited, EditedMask]:
     """The same for an edit that says something of a leaf: a mask that was rejected there comes back, if there is no
     other, and its rejection is contradicted. The later edit wins."""
     gone = _masks_at(place, [mask for _, mask in edited.rejected], scene)

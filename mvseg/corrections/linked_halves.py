@@ -14,9 +14,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mvseg.corrections.as_seen import seen_ids
 from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.numbers import EDITS
+from mvseg.corrections.unchanged_leaves import ids_before
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
@@ -43,7 +43,7 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
     masks, links = corrected.masks, corrected.links
     if not len(links.must):
         return corrected
-    ids = seen_ids(masks, before)
+    ids = ids_before(masks, before)
     is_linked = masks.is_linked
     for one, other in sorted({(min(pair), max(pair)) for pair in ids[links.must].tolist()}):
         halves = _in_one_photo(masks, ids == one, ids == other) if 0 < one < other else []

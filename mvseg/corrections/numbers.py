@@ -49,7 +49,7 @@ class QuestionNumbers:
     half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
     least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf
     most_places: int = 12  # limit: places that one question shows, at most
-    looked_px: int = 600  # limit: longer side of a photo in which places are looked for
+    search_px: int = 600  # limit: longer side of a photo in which places are looked for
     opening: int = 5  # chosen: width of a place in these pixels, at least: stems are thinner, and seams beside masks
     compact: float = 0.25  # chosen: square of its largest width, as a share of its area, at least: stems have less
     beside: int = 3  # chosen: distance between a mask and what it leaves out of its leaf, in these pixels, at most
@@ -58,4 +58,4 @@ class QuestionNumbers:
 
 
 EDITS = EditNumbers()
-DOUBTS = QuestionNumbers()
+QUESTIONS = QuestionNumbers()

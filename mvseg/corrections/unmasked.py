@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.corrections.numbers import DOUBTS
+from mvseg.corrections.numbers import QUESTIONS
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.verification.leaf_color import has_leaf_color, thin_views
@@ -45,7 +45,7 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
     """
     if not masks.num_instances:
         return []
-    views, colors = thin_views(masks, photos, most_px=DOUBTS.looked_px)
+    views, colors = thin_views(masks, photos, most_px=QUESTIONS.search_px)
     return [
         part
         for view, (photo, rows, step) in enumerate(views)
@@ -56,15 +56,15 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
 
 
 def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: float) -> Iterator[Unmasked]:
-    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((DOUBTS.opening,) * 2, np.uint8))
+    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((QUESTIONS.opening,) * 2, np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
-    (height, width), beside = rows.shape, DOUBTS.beside
+    (height, width), beside = rows.shape, QUESTIONS.beside
     for label in range(1, count):
         left, top, wide, high, area = stats[label].tolist()
         if area * step**2 < least_area:
             continue
         is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
-        if not is_inside or area > DOUBTS.most_share * rows.size:
+        if not is_inside or area > QUESTIONS.most_share * rows.size:
             labels = np.where(_widest_place(labels == label), label, np.where(labels == label, 0, labels))
             left, top, wide, high = cv2.boundingRect((labels == label).astype(np.uint8))
             area = int((labels == label).sum())
@@ -72,7 +72,7 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
                 continue
         box = np.s_[max(top - beside, 0) : top + high + beside, max(left - beside, 0) : left + wide + beside]
         part = (labels[box] == label).astype(np.uint8)
-        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < DOUBTS.compact * area:
+        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < QUESTIONS.compact * area:
             continue
         touched = rows[box][cv2.dilate(part, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0]
         touching, numbers = np.unique(touched[touched >= 0], return_counts=True)
@@ -88,10 +88,10 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
 
 
 def _widest_place(part: Bools) -> Bools:
-    """(h, w) of a part, what lies around the middle of its largest circle, up to `DOUBTS.widest` radii away."""
+    """(h, w) of a part, what lies around the middle of its largest circle, up to `QUESTIONS.widest` radii away."""
     distance = cv2.distanceTransform(np.pad(part.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     row, column = np.unravel_index(int(distance.argmax()), part.shape)
     rows, columns = np.ogrid[: part.shape[0], : part.shape[1]]
-    near: Bools = np.hypot(rows - row, columns - column) <= DOUBTS.widest * distance[row, column]
+    near: Bools = np.hypot(rows - row, columns - column) <= QUESTIONS.widest * distance[row, column]
     place: Bools = part & near
     return place

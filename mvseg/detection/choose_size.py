@@ -26,14 +26,14 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
     Returns:
         What was found at the best size, see `order_sizes`.
     """
-    looked, size, num_misses = [first], float(first.passes[0].longest), 0
+    results, size, num_misses = [first], float(first.passes[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
-        found, best = see(round(size)), max(looked, key=lambda each: each.agreed_area)
+        found, best = see(round(size)), max(results, key=lambda each: each.agreed_area)
         num_misses = 0 if found.agreed_area > best.agreed_area else num_misses + 1
-        looked.append(found)
+        results.append(found)
         if num_misses > (best.leaves.agreement < DETECTION.clear_agreement):
             break
-    return order_sizes(looked)
+    return order_sizes(results)
 
 
 def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> list[PassResult]:
@@ -51,8 +51,8 @@ def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> li
     return order_sizes([see(each) for each in sizes])
 
 
-def order_sizes(looked: Sequence[PassResult]) -> list[PassResult]:
+def order_sizes(results: Sequence[PassResult]) -> list[PassResult]:
     """Passes by their agreed area: the best one; of equals, the first. And the next best one, if some
     of the views cannot tell the two apart (`DETECTION.as_good`): then all of them should."""
-    ordered = sorted(looked, key=lambda each: -each.agreed_area)
+    ordered = sorted(results, key=lambda each: -each.agreed_area)
     return [each for each in ordered[:2] if each.agreed_area >= DETECTION.as_good * ordered[0].agreed_area]

@@ -121,7 +121,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
-            matching = _said_of(self._match(detections, cameras.to(images[0].device)))
+            matching = _disagreement_of(self._match(detections, cameras.to(images[0].device)))
             return self._collect(detections, sizes, masks=matching.masks)
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
@@ -146,13 +146,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         if not self.verify:
-            return _said_of(self.match_detections(detections, cameras))
+            return _disagreement_of(self.match_detections(detections, cameras))
         config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
         posed = cameras.to("cpu")
         detected = Pass.of(self, detections, posed, min_score=config.min_score)
         leaves = find_leaves(detected, posed, config=config).leaves
         missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
-        return _said_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
+        return _disagreement_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -224,7 +224,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         return results
 
 
-def _said_of(matching: Matching) -> Matching:
+def _disagreement_of(matching: Matching) -> Matching:
     """The same; warns (InputWarning) where the views disagree, see `find_disagreement`."""
     if (disagreement := find_disagreement(matching, is_detected=True)) is not None:
         warn(disagreement)

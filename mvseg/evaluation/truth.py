@@ -11,7 +11,7 @@ from torch import Tensor
 from mvseg.regions import Regions
 
 
-def shown_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: bool = True) -> int:
+def true_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: bool = True) -> int:
     """The true instance that one mask shows: the most frequent true label under it.
 
     Args:
@@ -29,10 +29,10 @@ def shown_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: boo
     return int(counts.argmax())
 
 
-def shown_instances(regions: Regions, truth: Sequence[np.ndarray], *, count_background: bool = True) -> Tensor:
-    """(D,) int64 on the CPU: `shown_instance` of every region; `truth` are V label maps in the frame of the regions."""
+def true_instances(regions: Regions, truth: Sequence[np.ndarray], *, count_background: bool = True) -> Tensor:
+    """(D,) int64 on the CPU: `true_instance` of every region; `truth` are V label maps in the frame of the regions."""
     shown = (
-        shown_instance(labels, mask, count_background=count_background) for labels, mask in region_crops(regions, truth)
+        true_instance(labels, mask, count_background=count_background) for labels, mask in region_crops(regions, truth)
     )
     return torch.tensor(list(shown), dtype=torch.int64)
 

@@ -8,10 +8,10 @@ import torch
 from torch import Tensor
 
 from mvseg.corrections.apply import apply
-from mvseg.corrections.as_seen import leave_joined, leaves_as_seen, seen_ids
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
+from mvseg.corrections.unchanged_leaves import ids_before, leave_joined, unchanged_leaves
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
@@ -26,18 +26,20 @@ from mvseg.verification.drawn_leaves import follow_drawn
 def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     """Apply the user's edits (`mvseg.corrections.apply`), then match and choose again.
 
-    Edits are about `Plant.shown`. Without any edits, the plant is returned as it is. The reprojection error is that of
-    the masks before edits, unless the user drew more than half as many as there were.
+    Edits are about `Plant.editable`. Without any edits, the plant is returned as it is. The reprojection error is that
+    of the masks before edits, unless the user drew more than half as many as there were.
     """
     if corrections is None or not corrections.edits:
         return plant
     opened, cameras, config = plant.opened, plant.scene.cameras, plant.opened.config
     with timed("correct"):
-        editable, before = plant.shown, plant.masks.to("cpu")
+        editable, before = plant.editable, plant.masks.to("cpu")
         corrected = apply(corrections, editable, plant.scene)
         corrected = link_halves(corrected, before, cameras.to("cpu"))
-        previous = seen_ids(corrected.masks, before) if opened.is_chosen else torch.full_like(corrected.last_edits, -1)
-        previous = previous.where(torch.isin(previous, leaves_as_seen(corrected, previous, before)), -1)
+        previous = torch.full_like(corrected.last_edits, -1)
+        if opened.is_chosen:
+            previous = ids_before(corrected.masks, before)
+        previous = previous.where(torch.isin(previous, unchanged_leaves(corrected, previous, before)), -1)
     with timed("match"):
         matched, previous = _match_anew(plant, corrected, previous)
     masks, corrected = apply_everywhere(corrected, matched.masks)
@@ -64,8 +66,8 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
             plant.proposals,
             cameras=cameras,
             more=plant.matched,
-            gone=_taken_away(editable, masks),
-            previous=seen_ids(masks, replace(corrected.masks, instance_ids=previous)),
+            removed=_removed_masks(editable, masks),
+            previous=ids_before(masks, replace(corrected.masks, instance_ids=previous)),
             drawn=plant.drawn,
             min_probability=config.detect.min_probability,
             cache=opened.surfaces,
@@ -106,7 +108,7 @@ def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[P
     return replace(plant, matching=matching, disagreement=disagreement), previous
 
 
-def _taken_away(before: Masks, after: Masks) -> Masks:
+def _removed_masks(before: Masks, after: Masks) -> Masks:
     """The detected masks of a table that are not in it any more, after the user's edits."""
     is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
     return before.select(~torch.isin(before.regions.labels, after.regions.labels.cpu()[is_left]))

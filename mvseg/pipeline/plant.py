@@ -95,7 +95,7 @@ class Plant:
         return int((self.boxes[:, 2:] - self.boxes[:, :2]).max())
 
     @cached_property
-    def shown(self) -> Masks:
+    def editable(self) -> Masks:
         """The masks that the user sees, and edits: those that were given, or those that the views chose, and what else
         was surely detected beside these."""
         if self.opened.is_chosen:
@@ -109,7 +109,7 @@ class Plant:
 
     def draw_ahead(self) -> None:
         """Find what all edits of chosen masks begin with, before anybody waits for the first one."""
-        _ = self.shown, [each.is_shared for each in self.drawn]
+        _ = self.editable, [each.is_shared for each in self.drawn]
 
     @cached_property
     def leaf_colors(self) -> NDArray[np.bool_]:

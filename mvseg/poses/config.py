@@ -55,7 +55,7 @@ class PoseConfig:
 
 
 @dataclass(frozen=True)
-class Known:
+class WorldFacts:
     """Facts that are known of the world; at most one of the first four.
 
     Attributes:

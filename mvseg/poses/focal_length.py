@@ -29,8 +29,8 @@ class FocalLength:
         return f"focal length {self.px:.0f} +- {self.deviation:.2g} px ({self.deviation / self.px:.1%})"
 
     def doubts(self, code: str, where: str = "") -> list[Finding]:
-        """The finding of this code where the deviation is above `TABLE.sure`, none where it is not."""
-        if self.deviation is None or self.deviation <= TABLE.sure * self.px:
+        """The finding of this code where the deviation is above `TABLE.most_sd`, none where it is not."""
+        if self.deviation is None or self.deviation <= TABLE.most_sd * self.px:
             return []
         values = {"px": self.px, "deviation": self.deviation, "share": self.deviation / self.px}
         return [Finding(code, where, values)]
@@ -87,7 +87,7 @@ def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
         groups.setdefault(model.images[number].camera_id, []).append(place)
     spread = max(float(lengths[group].std() / lengths[group].mean()) for group in groups.values())
     doubt = float(np.median(deviations / lengths))
-    return lengths if spread > max(TABLE.sure, TABLE.apart * doubt) else None
+    return lengths if spread > max(TABLE.most_sd, TABLE.apart * doubt) else None
 
 
 def zoom_finding(lengths: NDArray[np.float64], shared: float) -> Finding:

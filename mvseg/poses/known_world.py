@@ -20,7 +20,7 @@ from mvseg.formats.markers import Corner, find_board, find_scene_markers, read_g
 from mvseg.formats.photos import Photos
 from mvseg.formats.positions import read_positions
 from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
-from mvseg.poses.config import Known
+from mvseg.poses.config import WorldFacts
 from mvseg.poses.numbers import WORLD
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Scene
@@ -61,7 +61,7 @@ class Placement:
         return f"scale from {self.source}{fit}{wrong}"
 
 
-def place(scene: Scene, world: Known) -> Placement:
+def place(scene: Scene, world: WorldFacts) -> Placement:
     """The similarity that transforms a scene into the known world.
 
     Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.

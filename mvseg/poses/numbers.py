@@ -46,7 +46,7 @@ class VideoNumbers:
     small: int = 480
     corners: int = 200  # limit: corners that are followed; a third fewer or more measure a tenth less or more motion
     least_corners: int = 3  # limit: corners that are found again, at least, to measure a motion
-    kept: float = 0.5  # chosen: share of the corners that are still followed, below which new ones are found
+    least_followed: float = 0.5  # chosen: share of the corners that are still followed, below which new ones are found
     window: int = 21  # definition: pixels of OpenCV's window around a corner
     levels: int = 4  # limit: halvings of the picture: motion of up to 160 pixels of `small`
 
@@ -79,7 +79,7 @@ class TableNumbers:
     noise_px: float = 0.1  # chosen: standard deviation of the corners, until it is measured
     least_noise_px: float = 0.02  # chosen: the same that is believed, at least
     apart: float = 3.0  # chosen: spread of focal lengths of single photos, in their deviation, above which they differ
-    sure: float = 0.01  # chosen: standard deviation of a focal length, as a share of it, at most: more shows in heights
+    most_sd: float = 0.01  # chosen: standard deviation of a focal length, as a share of it; more shows in heights
     off_middle: float = 0.01  # chosen: sd of principal points of phones, cameras and webcams, in longer sides
 
 

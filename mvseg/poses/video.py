@@ -142,7 +142,7 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
         return _find_corners(grey), VIDEO.step, VIDEO.step
     start, now = track.start[is_kept], now[is_kept]
     moved = float(np.median(np.linalg.norm(now - start, axis=2))) / max(grey.shape)
-    if moved < VIDEO.anew and is_kept.sum() >= VIDEO.kept * len(is_kept):
+    if moved < VIDEO.anew and is_kept.sum() >= VIDEO.least_followed * len(is_kept):
         return _Track(start=start, now=now, grey=grey), moved, 0.0
     return _find_corners(grey), moved, moved
 

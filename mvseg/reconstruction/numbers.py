@@ -192,7 +192,7 @@ class QualityNumbers:
     clean_iou: float = 0.95  # chosen: median IoU above which it is doubted if it lacks too much of a single mask
     most_lacking: float = 0.05  # chosen: what that is, as a share of the median mask
     # A patch fills the bays of a star: 2.5 % of it lie there, of leaves, hearts and rectangles 0.5 % at most.
-    shown: float = 0.2  # chosen: share of the masks that show a part, below which it is not shown
+    least_shown: float = 0.2  # chosen: share of the masks that show a part, below which it is not shown
     most_unshown: float = 0.02  # chosen: share of its area that is not shown, above which it is doubted
     # The midrib ends in a corner: rectangles have 0.9 there, discs and hearts 0.4, leaves 0.3.
     near_end: float = 0.02  # chosen: distance from an end where its width is measured, as a share of its length
@@ -297,7 +297,7 @@ class ThinNumbers:
     beside_px: int = 2  # chosen: distance from a mask within which a leaf may still hide something
     around_px: int = 15  # chosen: distance to what is around a thin part: it is less wide than this
     quiet: float = 2.0  # chosen: difference in colour that means nothing, in the median one
-    sure: float = 4.0  # chosen: difference above that which is sure, in the median one
+    surely: float = 4.0  # chosen: difference above that which is sure, in the median one
     least_apart: float = 6.0  # chosen: the same in steps of L, a and b, at least
     beyond: float = 0.15  # chosen: how far cells reach beyond the leaves, in the extent of these
     coarse_cells: int = 32  # limit: cells along the plant, at first

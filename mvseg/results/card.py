@@ -26,27 +26,27 @@ class Card:
     """The last lines of a run, the field `card` of run.json, and the first lines of the page.
 
     Attributes:
-        found: how many leaves, in how many photos.
+        summary: how many leaves, in how many photos.
         doubt: the finding that explains most faults; None where there is none.
         next_step: what helps most, and the command that does it.
     """
 
-    found: str
+    summary: str
     doubt: Finding | None
     next_step: str
 
     def as_json(self) -> dict[str, str]:
         """The card as run.json holds it."""
-        return {"found": self.found, "doubt": str(self.doubt or ""), "next_step": self.next_step}
+        return {"found": self.summary, "doubt": str(self.doubt or ""), "next_step": self.next_step}
 
 
 def make_card(result: Result, out: Path) -> Card:
     """The card of a result that is written to `out`."""
     doubt = _gravest(result)
-    return Card(_say_found(result), doubt, _next_step(result, doubt, shlex.quote(str(out))))
+    return Card(_summarize(result), doubt, _next_step(result, doubt, shlex.quote(str(out))))
 
 
-def _say_found(result: Result) -> str:
+def _summarize(result: Result) -> str:
     num_photos, num_leaves = len(result.scene.views), result.matching.num_instances
     sentence = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
     if result.traits is not None and (counted := int(result.traits.whole["number_of_leaves"].value)) != num_leaves:

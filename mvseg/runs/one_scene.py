@@ -80,7 +80,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     say(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
     if is_shown:
-        lines = {"found": card.found, "in doubt": str(card.doubt or ""), "next": card.next_step}
+        lines = {"found": card.summary, "in doubt": str(card.doubt or ""), "next": card.next_step}
         lines |= {"look at": str(out / REPORT_FILE)} if request.config.report else {}
         for word, sentence in lines.items():
             if sentence:

@@ -16,7 +16,7 @@ from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
-from mvseg.poses.config import Known, PoseConfig
+from mvseg.poses.config import PoseConfig, WorldFacts
 from mvseg.poses.focal_length import FocalLength, find_zooms, focal_lengths, least_sure, zoom_finding
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
@@ -37,7 +37,7 @@ def pose_photos(
     out: Path,
     *,
     config: PoseConfig = PoseConfig(),
-    world: Known = Known(),
+    world: WorldFacts = WorldFacts(),
     up: Up | None = None,
 ) -> Scene:
     """Estimate the cameras of photos, and write a scene folder that `load_scene` reads: whole, or not at all.

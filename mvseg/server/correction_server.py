@@ -130,7 +130,7 @@ Task = Idle | Computing | Learning | Closed
 
 
 @dataclass(frozen=True)
-class Shown:
+class PageState:
     """The newest result on the page.
 
     Attributes:
@@ -163,7 +163,7 @@ class Corrector(Generic[Kind]):
         """Raises InputError: the corrections saved in the folder cannot be read, or are another scene's."""
         self.opened, self.news, self.number = opened, threading.Condition(), 0
         self.edits = SavedEdits(opened.folder, opened.read_edits)
-        self.shown = Shown(Update(None, [""] * len(self.edits.corrections.edits), []), self.edits.notice)
+        self.page_state = PageState(Update(None, [""] * len(self.edits.corrections.edits), []), self.edits.notice)
         self._numbers = itertools.count()  # of lists of edits
         self.task: Task = Computing(next(self._numbers))
         self.making: str | None = None
@@ -176,7 +176,7 @@ class Corrector(Generic[Kind]):
                 if self.edits.take_changes(self.opened.read_edits):
                     self._compute_anew()
             except InputError as error:
-                self.shown = replace(self.shown, problem=f"{error}. The edits on this page are those before.")
+                self.page_state = replace(self.page_state, problem=f"{error}. The edits on this page are those before.")
             corrections = self.edits.corrections
         return self.opened.page(corrections).encode()
 
@@ -205,7 +205,7 @@ class Corrector(Generic[Kind]):
         def is_old() -> bool:
             return not isinstance(self.task, Learning) or self.task.is_cancelled
 
-        problem, is_learned = self.shown.problem, False
+        problem, is_learned = self.page_state.problem, False
         try:
             self._learner().learn(corrections, is_old, self._tell_learning)
             is_learned = True
@@ -216,7 +216,7 @@ class Corrector(Generic[Kind]):
         except Exception as error:  # nor over this
             problem = f"Nothing was learned ({type(error).__name__}: {error})."
         with self.news:
-            self.shown = replace(self.shown, problem=problem)
+            self.page_state = replace(self.page_state, problem=problem)
             if isinstance(self.task, Learning):
                 self.task = Computing(next(self._numbers)) if is_learned else self.task.then
             self._notify()
@@ -248,7 +248,7 @@ class Corrector(Generic[Kind]):
         def publish(update: Update, problem: str) -> None:
             with self.news:
                 self._notify()
-                self.shown = Shown(update, problem, self.number)
+                self.page_state = PageState(update, problem, self.number)
                 if is_asked(self.task):
                     self.task = Idle()
                 elif isinstance(self.task, Learning) and is_asked(self.task.then):
@@ -265,7 +265,7 @@ class Corrector(Generic[Kind]):
             problem = str(error)
         except Exception as error:  # the user must not lose the page over what one list of edits does
             problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
-        publish(Update(self.shown.update.news, [""] * len(corrections.edits), []), problem)
+        publish(Update(self.page_state.update.news, [""] * len(corrections.edits), []), problem)
 
     def _compute_anew(self) -> None:
         """Ask for the consequences of the edits, for whoever holds the lock; if the detector learns, afterwards."""
@@ -290,7 +290,7 @@ class Corrector(Generic[Kind]):
                 if self.edits.is_changed():
                     break
                 self.news.wait(LOOK_SECONDS)
-            task, page = self.task, self.shown
+            task, page = self.task, self.page_state
             computing = task.then if isinstance(task, Learning) else task
             return {
                 "number": self.number,
@@ -382,7 +382,8 @@ class Corrector(Generic[Kind]):
                 raise InputError(sentence or "the run was stopped")
             opened = self.opened.reopened()
             with self.news:
-                self.opened, self.shown = opened, replace(self.shown, update=replace(self.shown.update, news=None))
+                self.opened = opened
+                self.page_state = replace(self.page_state, update=replace(self.page_state.update, news=None))
                 self._compute_anew()
         finally:
             self._tell_making(None)

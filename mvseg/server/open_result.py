@@ -18,10 +18,10 @@ import torch
 from pydantic import BaseModel, Field
 from torch import Tensor
 
-from mvseg.corrections.as_seen import name_each
 from mvseg.corrections.file import Corrections, Point, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
+from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, collect_warnings
@@ -318,7 +318,7 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
             learned finds it, votes for the leaf of the mask that it covers (`EVIDENCE.fits`). None: there are none.
     """
     masks = result.masks
-    names, ids, areas = name_each(masks.regions), masks.instance_ids.tolist(), masks.regions.areas.tolist()
+    names, ids, areas = name_regions(masks.regions), masks.instance_ids.tolist(), masks.regions.areas.tolist()
     named = [(ids[row], areas[row], name, row) for row, name in enumerate(names) if ids[row] > 0]
     votes = Counter[tuple[int, int]]()
     for instance, area, name, row in named:

@@ -24,7 +24,7 @@ from mvseg.tracking.track import Tracks, track_leaves
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class _TracksPage:
     """What a page shows: tracks, and what follows from them for it."""
 
     tracks: Tracks
@@ -107,11 +107,11 @@ class OpenTracks:
         links, problems = find_plant_links(corrections.edits, self.dates)
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
-    def _track(self, links: Sequence[LeafLink]) -> _Shown:
+    def _track(self, links: Sequence[LeafLink]) -> _TracksPage:
         tracks = self._track_with(links)
         data = describe_tracks(tracks, measure_growth(tracks))
         data["questions"] = [_describe_question(each) for each in list_questions(tracks, links)]
-        return _Shown(tracks, data)
+        return _TracksPage(tracks, data)
 
     def _track_with(self, links: Sequence[LeafLink]) -> Tracks:
         return track_leaves(self.dates, links=links, pots=self.recorded.pots, plant=self.plant.plant)

@@ -1,4 +1,4 @@
-"""Tracks over all dates at once: the sights of leaves are parted such that the costs within tracks are least.
+"""Tracks over all dates at once: the observations of leaves are parted such that the costs within tracks are least.
 
 Not only neighbouring dates count: each leaf is compared with those of the three dates before and after, and a track's
 cost is the sum over all of its pairs. A leaf that looks odd on one date, or is missed, is held by the dates around it.
@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.compare import Comparison, Sight
+from mvseg.tracking.compare import Comparison, Observation
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.numbers import LINKING
 
@@ -26,13 +26,13 @@ CALIBRATION = (0.33, 4.08)
 
 @dataclass(frozen=True)
 class Association:
-    """Two sights of one leaf that follow each other, and the probability that they are of one: 1 if the user says so.
+    """Two observations of one leaf that follow each other, and the probability that they are: 1 if the user says so.
 
     `link_leaves` gives it for dates that are surely aligned, `sum_over_poses` for any.
     """
 
-    before: Sight
-    after: Sight
+    before: Observation
+    after: Observation
     probability: float
     is_asked: bool = False
 
@@ -41,14 +41,14 @@ def link_leaves(
     counts: Sequence[int],
     costs: Mapping[tuple[int, int], Floats],
     *,
-    same: Collection[tuple[Sight, Sight]] = (),
-    different: Collection[tuple[Sight, Sight]] = (),
+    same: Collection[tuple[Observation, Observation]] = (),
+    different: Collection[tuple[Observation, Observation]] = (),
 ) -> list[Association]:
-    """The links of the cheapest tracks, by their earlier sight.
+    """The links of the cheapest tracks, by their earlier observation.
 
     Args:
         counts: number of leaves with a shape on each date.
-        same, different: pairs of sights that the user says are one leaf, or are not.
+        same, different: pairs of observations that the user says are one leaf, or are not.
 
     Raises:
         InputError: the pairs contradict each other.
@@ -62,7 +62,7 @@ def link_leaves(
     for place, gain in asked.items():
         gains[place] = gain
     gains += gains.T
-    tracks = join_sights(gains, date_of)
+    tracks = join_observations(gains, date_of)
     if any((tracks[one] == tracks[other]) != (gain > 0) for (one, other), gain in asked.items()):
         raise InputError("what the user says of leaves over days contradicts itself")
     links = []
@@ -102,12 +102,12 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     return chances
 
 
-def join_sights(gains: Floats, date_of: np.ndarray) -> np.ndarray:
-    """(S,) the track of each sight, such that the gains within tracks are large; none has two sights of a date.
+def join_observations(gains: Floats, date_of: np.ndarray) -> np.ndarray:
+    """(S,) the track of each observation, such that gains within tracks are large; no track has two of one date.
 
     Args:
         gains: (S, S) symmetric, of each pair in one track; 0 for pairs that were not compared.
-        date_of: (S,) index of the date of each sight.
+        date_of: (S,) index of the date of each observation.
     """
     tracks, dates = np.arange(len(gains)), np.unique(date_of)
     for date in dates[1:]:
@@ -138,13 +138,13 @@ def _rejoin(tracks: np.ndarray, gains: Floats, apart: np.ndarray, among: np.ndar
 def _part_gains(
     tracks: np.ndarray, gains: Floats, one: np.ndarray, other: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Floats]:
-    """The tracks among the sights `one` (S,) and `other` (S,), and the gains (A, B) of joining each two of them."""
+    """Tracks of the observations `one` (S,) and `other` (S,), and gains (A, B) of joining each two of them."""
     (here, row), (there, column) = (np.unique(tracks[part], return_inverse=True) for part in (one, other))
     return here, there, np.eye(len(here))[row].T @ gains[np.ix_(one, other)] @ np.eye(len(there))[column]
 
 
 def _probabilities(tracks: np.ndarray, gains: Floats, later: np.ndarray) -> dict[int, float]:
-    """{track: that its later sights are of the same leaf as those before}, against all other parts each could go with.
+    """{track: that its later observations show the leaf of the earlier ones}, against all parts that they could join.
 
     With gains as log odds, p = e^g / (1 + e^g + the sum of e^g over the others); its log odds are then stretched
     (`CALIBRATION`).

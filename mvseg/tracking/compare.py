@@ -27,7 +27,7 @@ from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
-Sight = tuple[int, int]  # index of the date, row of its `DateLeaves`
+Observation = tuple[int, int]  # index of the date, row of its `DateLeaves`
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,25 +59,25 @@ def compare_dates(
     *,
     knows_up: bool,
     pots: Pots = "auto",
-    same: Collection[tuple[Sight, Sight]] = (),
-    different: Collection[tuple[Sight, Sight]] = (),
+    same: Collection[tuple[Observation, Observation]] = (),
+    different: Collection[tuple[Observation, Observation]] = (),
 ) -> Comparison:
     """Dates at most `LINKING.most_gap` apart are compared.
 
     `place_dates` says how they stand to each other, before anything is linked. Of `same` and `different`, pairs of
-    sights that the user says are one leaf, or are not, the earlier one first, the poses take note.
+    observations that the user says are one leaf, or are not, the earlier one first, the poses take note.
     """
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
         for later in range(len(dates)) for n in range(max(later - LINKING.most_gap, 0), later)
     }  # fmt: skip
-    for said, cost in ((same, -LINKING.said), (different, LINKING.said)):
+    for said, cost in ((same, -LINKING.user_odds), (different, LINKING.user_odds)):
         for (earlier, row), (later, column) in said:
             if (earlier, later) in pairs:
                 pairs[earlier, later].link_costs[row, column] = cost
-    looked = {place: list_poses(pair) for place, pair in pairs.items()}
-    habit = Habit.of([judge(poses, Habit.of([], pots)) for poses in looked.values()], pots)
-    poses, roots, steady = place_dates(len(dates), looked, habit)
+    poses_of_pairs = {place: list_poses(pair) for place, pair in pairs.items()}
+    habit = Habit.of([judge(poses, Habit.of([], pots)) for poses in poses_of_pairs.values()], pots)
+    poses, roots, steady = place_dates(len(dates), poses_of_pairs, habit)
     trust = np.eye(len(dates))
     costs: dict[tuple[int, int], Floats] = {}
     otherwise: dict[tuple[int, int], Floats] = {}
@@ -85,11 +85,12 @@ def compare_dates(
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
         pair, pose = pairs[earlier, later], step_between(poses, (earlier, later))
         alignment = refine_alignment(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
-        trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.pose, habit)
+        chance = poses_of_pairs[earlier, later].chance(alignment.pose, habit)
+        trust[earlier, later] = steady[earlier:later].min() * chance
         if not len(alignment.pairs):
             continue
         costs[earlier, later] = bent_costs(pair, alignment)
-        otherwise[earlier, later] = _under_others(looked[earlier, later], pose, habit)
+        otherwise[earlier, later] = _under_others(poses_of_pairs[earlier, later], pose, habit)
         is_step = roots[later] not in roots[earlier + 1 : later]
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
             motion = find_motion(pair, alignment.pose)
@@ -107,15 +108,15 @@ def compare_dates(
     )  # fmt: skip
 
 
-def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
+def _under_others(of_pair: Poses, pose: Floats, habit: Habit) -> Floats:
     """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
     there is none."""
-    every = np.stack([each.pose for each in looked.refined])
-    weights = np.round(looked.weights(habit), ALIGN.digits) * (pose_distances(looked.pair, pose, every) >= 1)
-    chances = np.zeros((len(looked.pair.first), len(looked.pair.second)))
+    every = np.stack([each.pose for each in of_pair.refined])
+    weights = np.round(of_pair.weights(habit), ALIGN.digits) * (pose_distances(of_pair.pair, pose, every) >= 1)
+    chances = np.zeros((len(of_pair.pair.first), len(of_pair.pair.second)))
     for weight, other in zip(weights / (weights.sum() or 1.0), every, strict=True):
         if weight:
-            costs = fitted_costs(looked.pair.moved(other), LINKS)
+            costs = fitted_costs(of_pair.pair.moved(other), LINKS)
             odds = np.exp(np.clip(-costs, -LINKING.most_odds, LINKING.most_odds))
             rivals = odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds
             chances += weight * odds / (1 + rivals)

@@ -21,7 +21,7 @@ from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, c
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
-from mvseg.tracking.numbers import SIGHTS
+from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.pictures import LeafPicture, picture_leaves, picture_plant
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
@@ -164,7 +164,7 @@ def read_time(time: str | float) -> float:
     if you like: then it is counted in UTC).
 
     Raises:
-        InputError: it is neither; so are 0428 and numbers of `SIGHTS.most_days` or more, which are no days.
+        InputError: it is neither; so are 0428 and numbers of `OBSERVATIONS.most_days` or more, which are no days.
     """
     moment = _read_moment(str(time).strip())
     if isinstance(moment, float):
@@ -176,12 +176,12 @@ def read_time(time: str | float) -> float:
 
 def _read_moment(text: str) -> float | datetime.datetime:
     """A number of days, or a date."""
-    if NUMBER.fullmatch(text) and abs(float(text)) < SIGHTS.most_days:
+    if NUMBER.fullmatch(text) and abs(float(text)) < OBSERVATIONS.most_days:
         return float(text)
     with suppress(ValueError):
         if not text.isdecimal() or len(text) == 8:  # 13 digits would be a date of the year 1711
             return datetime.datetime.fromisoformat(text)
-    expected = f"expected a number (days) or an ISO date, as in 2026-05-31; days are below {SIGHTS.most_days}"
+    expected = f"expected a number (days) or an ISO date, as in 2026-05-31; days are below {OBSERVATIONS.most_days}"
     raise InputError(f"time '{text}': {expected}")
 
 
@@ -230,7 +230,7 @@ def name_apart(dates: Sequence[PlantOnDate]) -> list[PlantOnDate]:
                 folder = named[index].folder
                 longer = "" if folder is None else "/".join(folder.resolve().parts[-parts:])
                 named[index] = replace(named[index], scene=longer or named[index].scene)
-        if parts > SIGHTS.most_parts:  # the same folder twice, or results in memory
+        if parts > OBSERVATIONS.most_parts:  # the same folder twice, or results in memory
             break
     return named
 
@@ -269,13 +269,13 @@ def _see_leaf(
     number: int, shape: LeafSurface | VoxelGrid | None, numbers: Mapping[str, Number], frame: Floats | None
 ) -> SeenLeaf:
     vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
-    if len(vertices) < SIGHTS.cloud:
+    if len(vertices) < OBSERVATIONS.cloud:
         return SeenLeaf(number, None, None, None, False, numbers)
     points = vertices if frame is None else vertices @ frame.T
     if isinstance(shape, LeafSurface):
         return see_surface(number, points, MESH_SHAPE[1], numbers, is_oriented=shape.is_oriented)
     midrib, normal = _midrib_of_voxels(points)
-    cloud = points[np.linspace(0, len(points) - 1, SIGHTS.cloud).round().astype(int)]
+    cloud = points[np.linspace(0, len(points) - 1, OBSERVATIONS.cloud).round().astype(int)]
     return SeenLeaf(number, midrib, normal, cloud, False, numbers)
 
 
@@ -286,15 +286,15 @@ def see_surface(
     grid = vertices[1:-1].reshape(-1, columns, 3)
     midrib = resample(np.concatenate([vertices[:1], grid[:, columns // 2], vertices[-1:]]))
     normal = cell_normals(grid).sum((0, 1))
-    rows = np.linspace(0, len(grid) - 1, SIGHTS.rows).round().astype(int)
+    rows = np.linspace(0, len(grid) - 1, OBSERVATIONS.rows).round().astype(int)
     cloud = grid[rows][:, [0, columns // 2, -1]].reshape(-1, 3)
     return SeenLeaf(number, midrib, normal / max(float(np.linalg.norm(normal)), 1e-12), cloud, is_oriented, numbers)
 
 
 def resample(line: Floats) -> Floats:
-    """(`SIGHTS.stations`, 3) points evenly spread along a line (P, 3)."""
+    """(`OBSERVATIONS.stations`, 3) points evenly spread along a line (P, 3)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at = np.linspace(0, along[-1], SIGHTS.stations)
+    at = np.linspace(0, along[-1], OBSERVATIONS.stations)
     return np.stack([np.interp(at, along, line[:, axis]) for axis in range(3)], 1)
 
 
@@ -303,8 +303,8 @@ def _midrib_of_voxels(points: Floats) -> tuple[Floats, Floats]:
     center = points.mean(0)
     _, _, axes = np.linalg.svd(points - center, full_matrices=False)
     along = (points - center) @ axes[0]
-    edges = np.linspace(along.min(), along.max(), SIGHTS.stations + 1)
-    bins = np.clip(np.digitize(along, edges) - 1, 0, SIGHTS.stations - 1)
-    line = np.stack([points[bins == index].mean(0) for index in range(SIGHTS.stations) if (bins == index).any()])
+    edges = np.linspace(along.min(), along.max(), OBSERVATIONS.stations + 1)
+    bins = np.clip(np.digitize(along, edges) - 1, 0, OBSERVATIONS.stations - 1)
+    line = np.stack([points[bins == index].mean(0) for index in range(OBSERVATIONS.stations) if (bins == index).any()])
     ends = points[[along.argmin(), along.argmax()]]
     return resample(np.concatenate([ends[:1], line[1:-1], ends[1:]])), axes[2]

@@ -1,8 +1,8 @@
 """How unlike two leaves of different dates are, by scales of greatest likelihood: for finding how dates stand to each
 other, and for linking leaves (`bent_costs.py`).
 
-The cost of a pair is minus the logarithm of how much likelier its differences are between two sights of one leaf than
-between a leaf and a stranger. Each difference has a scale of its own, widened by the standard deviations that the
+The cost of a pair is minus the logarithm of how much likelier its differences are between two observations of one leaf
+than between a leaf and a stranger. Each difference has a scale of its own, widened by the standard deviations that the
 surfaces carry, and heavy tails: one odd number does not outweigh the others. A stranger is the nearer by chance, the
 more leaves there are.
 """
@@ -16,7 +16,7 @@ from scipy.spatial.distance import cdist
 
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
-from mvseg.tracking.numbers import COSTS, SIGHTS
+from mvseg.tracking.numbers import COSTS, OBSERVATIONS
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def size_costs(apart: Differences, scales: Scales) -> Floats:
 def _cloud_distances(pair: Pair) -> Floats:
     """(N, M) mean distance of the points of one leaf from the other, the nearer way of two: a leaf that is seen in part
     lies on the whole one."""
-    shape = (len(pair.first), SIGHTS.cloud, len(pair.second), SIGHTS.cloud)
+    shape = (len(pair.first), OBSERVATIONS.cloud, len(pair.second), OBSERVATIONS.cloud)
     apart = cdist(pair.first.points.reshape(-1, 3), pair.second.points.reshape(-1, 3)).reshape(shape)
     return np.minimum(apart.min(3).mean(1), apart.min(1).mean(2)) / pair.scale
 

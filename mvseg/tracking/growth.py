@@ -113,8 +113,8 @@ def measure_growth(tracks: Tracks) -> Growth:
             dates_of.setdefault(row.track, []).append((row.date, row.leaf))
     numbers_of: dict[str, dict[int, dict[int, Number]]] = {
         trait: {
-            track: {date: numbers[date][leaf][trait] for date, leaf in sights if trait in numbers[date][leaf]}
-            for track, sights in sorted(dates_of.items())
+            track: {date: numbers[date][leaf][trait] for date, leaf in observations if trait in numbers[date][leaf]}
+            for track, observations in sorted(dates_of.items())
         }
         for trait in TRAITS
     }

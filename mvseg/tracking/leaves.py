@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from mvseg.tracking.dates import Floats, PlantOnDate, SeenLeaf
-from mvseg.tracking.numbers import COSTS, SIGHTS
+from mvseg.tracking.numbers import COSTS, OBSERVATIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,9 +17,9 @@ class DateLeaves:
 
     Attributes:
         index: (N,) their places in `PlantOnDate.leaves`.
-        midribs: (N, `SIGHTS.stations`, 3) from base to tip.
+        midribs: (N, `OBSERVATIONS.stations`, 3) from base to tip.
         normals: (N, 3).
-        points: (N, `SIGHTS.cloud`, 3).
+        points: (N, `OBSERVATIONS.cloud`, 3).
         lengths: (N,).
         areas: (N,) one-sided; NaN where none is measured.
         base_sd, turn_sd: (N,) standard deviations of the base, in lengths, and of the azimuth, in radians.
@@ -79,9 +79,9 @@ def leaves_of(date: PlantOnDate) -> DateLeaves:
 
     return DateLeaves(
         index=np.array(date.shaped, int),
-        midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, SIGHTS.stations, 3),
+        midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, OBSERVATIONS.stations, 3),
         normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
-        points=np.array([leaf.points for leaf in shaped]).reshape(-1, SIGHTS.cloud, 3),
+        points=np.array([leaf.points for leaf in shaped]).reshape(-1, OBSERVATIONS.cloud, 3),
         lengths=np.array([leaf.length for leaf in shaped]),
         areas=np.array([leaf.numbers["area"].value if "area" in leaf.numbers else np.nan for leaf in shaped], float),
         base_sd=np.array([sd(leaf, "insertion_height") for leaf in shaped]),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class SightNumbers:
+class ObservationNumbers:
     """Observations of a leaf on a date."""
 
     stations: int = 9  # definition: points of a midrib, base and tip included
@@ -67,11 +67,11 @@ class CostNumbers:
 
 @dataclass(frozen=True)
 class LinkNumbers:
-    """Links from sight to sight of a leaf."""
+    """Links from observation to observation of a leaf."""
 
-    most_gap: int = 3  # chosen: max. dates from one sight to another that are compared, so that two may hide a leaf
+    most_gap: int = 3  # chosen: max. dates between compared observations: a leaf may be hidden on two
     unlinked: float = 2.0  # chosen: cost of a pair of leaves up to which one track is cheaper than two
-    said: float = 20.0  # definition: log odds of a link of the user, where poses are weighed: more than any leaf's own
+    user_odds: float = 20.0  # definition: log odds of a user's link for weighing poses: more than any leaf's
     asked: float = 1e4  # limit: gain of a link of the user, above all that leaves can say
     most_odds: float = 40.0  # limit: log odds, at most, so that their exponentials are numbers
     rounds: int = 10  # limit: rounds of joining anew, at most; two or three are enough
@@ -107,7 +107,7 @@ class PageNumbers:
     quality: int = 70  # definition: JPEG quality of pictures
 
 
-SIGHTS = SightNumbers()
+OBSERVATIONS = ObservationNumbers()
 ALIGN = AlignNumbers()
 MOTIONS = MotionNumbers()
 COSTS = CostNumbers()

@@ -18,7 +18,7 @@ from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
 from mvseg.tracking.dates import Number
 from mvseg.tracking.growth import SIZES, Growth
-from mvseg.tracking.numbers import PAGE, SIGHTS
+from mvseg.tracking.numbers import OBSERVATIONS, PAGE
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
@@ -81,7 +81,7 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         for leaf in date.leaves:
             row, shape, picture = rows[leaf.leaf], np.zeros((0, 3)), date.pictures.get(leaf.leaf)
             if leaf.points is not None and leaf.midrib is not None:
-                grid = leaf.points.reshape(SIGHTS.rows, 3, 3)  # of a surface: once around it, from base to tip and back
+                grid = leaf.points.reshape(OBSERVATIONS.rows, 3, 3)  # once around the surface, base to tip and back
                 shape = np.concatenate([grid[:, 0], grid[::-1, 2]]) if "length" in leaf.numbers else leaf.midrib
             placed = (shape @ pose[:3, :3].T + pose[:3, 3] - middle) / scale * 1000
             leaves.append(

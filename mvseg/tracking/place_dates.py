@@ -29,15 +29,15 @@ from mvseg.tracking.fitted_costs import fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN
 
-Looked = Mapping[tuple[int, int], Poses]
+PosesOfPairs = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 
 
-def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
+def place_dates(num_dates: int, poses_of_pairs: PosesOfPairs, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
     """The poses of T dates.
 
     Args:
-        looked: {(earlier, later): the poses of two dates that were looked at}.
+        poses_of_pairs: {(earlier, later): the poses of two dates that were looked at}.
 
     Returns:
         (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)
@@ -46,21 +46,21 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
     """
     if habit.still == 1:  # somebody says so
         return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
-    alignments = {pair: judge(poses, habit) for pair, poses in looked.items()}
+    alignments = {pair: judge(poses, habit) for pair, poses in poses_of_pairs.items()}
     chained, roots = chain_dates(num_dates, alignments)
-    likeliness = _remembered(looked, habit)
+    likeliness = _remembered(poses_of_pairs, habit)
     poses = _search(chained, alignments, likeliness)
     poses = np.linalg.inv(poses[roots]) @ poses
-    return poses, roots, weigh_turns(poses, looked, likeliness)
+    return poses, roots, weigh_turns(poses, poses_of_pairs, likeliness)
 
 
-def weigh_turns(poses: Floats, looked: Looked, likeliness: Likeliness) -> Floats:
+def weigh_turns(poses: Floats, poses_of_pairs: PosesOfPairs, likeliness: Likeliness) -> Floats:
     """(T - 1,) probability that the plant stands on all later dates as the poses (T, 4, 4) say, against the likeliest
     other turn between a date and the next: of a plant that looks the same from two sides, one half."""
     chances = np.ones(len(poses) - 1)
     for later in range(1, len(poses)):
-        across = [pair for pair in looked if pair[0] < later <= pair[1]]
-        step, rivals = looked.get((later - 1, later)), []
+        across = [pair for pair in poses_of_pairs if pair[0] < later <= pair[1]]
+        step, rivals = poses_of_pairs.get((later - 1, later)), []
         if step is None or not step.pair.fewer:
             continue
         now = np.linalg.inv(poses[later]) @ poses[later - 1]
@@ -124,12 +124,12 @@ def _move(
     return best
 
 
-def _remembered(looked: Looked, habit: Habit) -> Likeliness:
+def _remembered(poses_of_pairs: PosesOfPairs, habit: Habit) -> Likeliness:
     """The log odds of two dates standing as poses say; the same step between two dates is looked at once."""
 
     @cache
     def of_step(pair: tuple[int, int], step: bytes) -> float:
-        of_pair, pose = looked[pair].pair, np.frombuffer(step).reshape(4, 4)
+        of_pair, pose = poses_of_pairs[pair].pair, np.frombuffer(step).reshape(4, 4)
         return ALIGN.temper * _gain(of_pair, pose) + habit.world_prior * float(near_world(of_pair, pose[None])[0])
 
     def likeliness(poses: Floats, pair: tuple[int, int]) -> float:

@@ -14,7 +14,7 @@ from mvseg.tracking.dates import NUMBER
 from mvseg.tracking.numbers import ALIGN, PAGE
 from mvseg.tracking.track import Tracks
 
-Sight = tuple[int, int]  # index of the date, id of the leaf in its result
+Observation = tuple[int, int]  # index of the date, id of the leaf in its result
 
 
 @dataclass(frozen=True)
@@ -23,12 +23,12 @@ class Question:
 
     Attributes:
         before, after: the leaves.
-        is_linked: they are, as the tracks say; otherwise the one has no later sight, and the other no earlier one.
+        is_linked: they are, as the tracks say; otherwise `before` has no later observation, and `after` no earlier one.
         doubt: probability that the tracks are wrong there.
     """
 
-    before: Sight
-    after: Sight
+    before: Observation
+    after: Observation
     is_linked: bool
     doubt: float
 
@@ -53,16 +53,16 @@ def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Quest
 
 
 def _of_links(tracks: Tracks) -> Iterator[Question]:
-    for sights in _sights(tracks).values():
-        for (before, _), (after, chance) in pairwise(sights):
+    for observations in _observations(tracks).values():
+        for (before, _), (after, chance) in pairwise(observations):
             yield Question(before, after, True, round(1 - chance, 6))
 
 
 def _of_ends(tracks: Tracks) -> Iterator[Question]:
     """Of leaves that are gone, with those that appear afterwards."""
     shaped = [{date.leaves[place].leaf: row for row, place in enumerate(date.shaped)} for date in tracks.dates]
-    sights = list(_sights(tracks).values())
-    for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in sights for two in sights):
+    observations = list(_observations(tracks).values())
+    for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in observations for two in observations):
         chances = tracks.chances.get((earlier, later))
         if chances is not None and leaf in shaped[earlier] and other in shaped[later]:
             chance = float(chances[shaped[earlier][leaf], shaped[later][other]])
@@ -72,12 +72,12 @@ def _of_ends(tracks: Tracks) -> Iterator[Question]:
 def describe_changes(now: Tracks, then: Tracks) -> list[str]:
     """Describe the differences of other tracks of the same plant, a sentence each; leaves are called as they are
     now."""
-    names = {sight: track for track, sights in _sights(now).items() for sight, _ in sights}
-    before, after = _earlier_sights(now), _earlier_sights(then)
+    names = {leaf: track for track, observations in _observations(now).items() for leaf, _ in observations}
+    before, after = _earlier_observations(now), _earlier_observations(then)
     changes = []
-    for sight in sorted(before.keys() | after.keys()):
-        if before.get(sight) != (source := after.get(sight)) and sight in names:
-            leaf = f"leaf {names[sight]} of {_name_day(now, sight[0])}"
+    for observation in sorted(before.keys() | after.keys()):
+        if before.get(observation) != (source := after.get(observation)) and observation in names:
+            leaf = f"leaf {names[observation]} of {_name_day(now, observation[0])}"
             if source is None:
                 changes.append(f"{leaf} is a new one")
             elif source in names:
@@ -99,16 +99,16 @@ def _name_day(tracks: Tracks, date: int) -> str:
     return f"day {written}" if NUMBER.fullmatch(written) else written
 
 
-def _sights(tracks: Tracks) -> dict[int, list[tuple[Sight, float]]]:
+def _observations(tracks: Tracks) -> dict[int, list[tuple[Observation, float]]]:
     """{track: its leaves in the order of time, each with the probability of its link to the one before}."""
-    sights: dict[int, list[tuple[Sight, float]]] = {}
+    observations: dict[int, list[tuple[Observation, float]]] = {}
     for row in tracks.rows:
         if row.leaf is not None:
-            sights.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
-    return sights
+            observations.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
+    return observations
 
 
-def _earlier_sights(tracks: Tracks) -> dict[Sight, Sight]:
-    """{sight: the one before it in its track}."""
-    every = (pairwise(sights) for sights in _sights(tracks).values())
+def _earlier_observations(tracks: Tracks) -> dict[Observation, Observation]:
+    """{observation: the one before it in its track}."""
+    every = (pairwise(observations) for observations in _observations(tracks).values())
     return {after: before for pairs in every for (before, _), (after, _) in pairs}

@@ -15,7 +15,7 @@ from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.tracking.associate import Association, link_leaves, pairwise_chances, sum_over_poses
-from mvseg.tracking.compare import Comparison, Sight, compare_dates
+from mvseg.tracking.compare import Comparison, Observation, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
 from mvseg.tracking.leaves import leaves_of
@@ -35,8 +35,8 @@ class TrackRow:
         date: index into `Tracks.dates`.
         track: from 1 on: from below, by the mean height of its base, where up is known on all dates; otherwise in the
             order of appearance. The plants of other frames (`Tracks.roots`) and leaves without a shape come last.
-        state: "born" where it appears after the first date, "seen", "hidden" where it is missing between two sights,
-            "gone" on the first date on which it is missing for good.
+        state: "born" where it appears after the first date, "seen", "hidden" between two observations, "gone" on
+            the first date on which it is missing for good.
         leaf: its id in that date's result; None where the track is hidden or gone.
         probability: that the leaf is the one that the track showed before; NaN of the first one of a track, and where
             there is no leaf.
@@ -133,7 +133,7 @@ def _link_dates(
 ) -> tuple[Comparison, list[Association]]:
     leaves = [leaves_of(date) for date in dates]
     knows_up = all(date.knows_up for date in dates)
-    same, different = _sights_of(links, dates)
+    same, different = _observations_of(links, dates)
     times, counts = [date.time for date in dates], [len(each) for each in leaves]
     compared = compare_dates(leaves, times, knows_up=knows_up, pots=pots, same=same, different=different)
     linked = link_leaves(counts, compared.costs, same=same, different=different)
@@ -144,11 +144,11 @@ def _without_stems(
     dates: tuple[PlantOnDate, ...], links: Sequence[Association], named: Collection[tuple[str, int]]
 ) -> tuple[PlantOnDate, ...]:
     """The dates without what looks like a stem wherever it is seen; those (scene, leaf) that the user names stay."""
-    sights = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
-    track = {sight: sight for sight in sights}
-    for link in links:  # by their earlier sight
+    observations = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
+    track = {observation: observation for observation in observations}
+    for link in links:  # by their earlier observation
         track[link.after] = track[link.before]
-    sure = {track[n, row] for n, row in sights if not dates[n].leaves[dates[n].shaped[row]].is_doubted}
+    sure = {track[n, row] for n, row in observations if not dates[n].leaves[dates[n].shaped[row]].is_doubted}
     believed = []
     for n, date in enumerate(dates):
         in_tracks = {date.leaves[place].leaf for row, place in enumerate(date.shaped) if track[n, row] in sure}
@@ -158,9 +158,9 @@ def _without_stems(
     return tuple(believed)
 
 
-def _sights_of(
+def _observations_of(
     links: Sequence[LeafLink], dates: Sequence[PlantOnDate]
-) -> tuple[list[tuple[Sight, Sight]], list[tuple[Sight, Sight]]]:
+) -> tuple[list[tuple[Observation, Observation]], list[tuple[Observation, Observation]]]:
     """Pairs of rows of `Leaves` that are one leaf, in the order of time, and pairs that are not."""
     rows = {date.scene: (index, {date.leaves[n].leaf: k for k, n in enumerate(date.shaped)})
             for index, date in enumerate(dates)}  # fmt: skip
@@ -168,21 +168,22 @@ def _sights_of(
         raise InputError("two dates have results of one name, expected different names where links name them")
     same, different = [], []
     for link in links:
-        sights = []
+        observations = []
         for scene, leaf in link.leaves:
             if scene not in rows:
                 raise InputError(f"a link names the scene {scene}, expected one of {', '.join(rows)}")
             index, row_of = rows[scene]
             if leaf not in row_of:
                 raise InputError(f"a link names leaf {leaf} of {scene}, which is no leaf with a shape")
-            sights.append((index, row_of[leaf]))
-        sights.sort()
-        if link.is_same and len({date for date, _ in sights}) < len(sights):
-            raise InputError(f"a link says that two leaves of {dates[sights[0][0]].scene} are one, over days none are")
+            observations.append((index, row_of[leaf]))
+        observations.sort()
+        if link.is_same and len({date for date, _ in observations}) < len(observations):
+            scene = dates[observations[0][0]].scene
+            raise InputError(f"a link says that two leaves of {scene} are one, expected leaves of different dates")
         if link.is_same:
-            same += list(pairwise(sights))
+            same += list(pairwise(observations))
         else:
-            different += [(one, other) for one, other in combinations(sights, 2) if one[0] != other[0]]
+            different += [(one, other) for one, other in combinations(observations, 2) if one[0] != other[0]]
     if set(same) & set(different):
         raise InputError("two leaves are said to be the same and to be different")
     return same, different

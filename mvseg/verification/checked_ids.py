@@ -158,7 +158,7 @@ def find_shared(
     by_own = inside[every, leaf]
     inside[every, leaf] = 0
     second, by_second = inside.argmax(1), inside.max(1)
-    is_explained = (by_own >= PARTS.each) & (by_second >= PARTS.each) & (by_own + by_second >= PARTS.both)
+    is_explained = (np.minimum(by_own, by_second) >= PARTS.least_each) & (by_own + by_second >= PARTS.least_both)
     surfaces = {int(names[n]): each for n, each in enumerate(candidates.surfaces) if is_there[n] and each is not None}
     views, shared = regions.view_index.numpy(), []
     for view in np.unique(views[is_explained]).tolist():

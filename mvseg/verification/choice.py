@@ -41,13 +41,13 @@ class Step:
     rows: Ints
 
     @property
-    def shown(self) -> float:
+    def shown_share(self) -> float:
         """Share of its expected area that its masks show, see `leaf_features`."""
         return float(self.features[1])
 
 
 @dataclass(frozen=True, eq=False)
-class Chosen:
+class Choice:
     """L leaves, the likeliest first.
 
     Attributes:
@@ -96,7 +96,7 @@ class Statements:
         """(D,) whether an edit says that the mask shows none of the leaves that edits changed."""
         return self.is_held & (~self.is_sure | (self.leaf > 0))
 
-    def candidates_as_seen(self, q: Floats, is_taken: Bools) -> Ints:
+    def unchanged_candidates(self, q: Floats, is_taken: Bools) -> Ints:
         """Candidate of each mask (D,) of a leaf that stays and that an edit is about, -1 for the others: the one that
         all masks of the leaf show best by q (D, K). Accepted candidates (K,) first, then all."""
         of_mask = np.full(len(q), -1)
@@ -143,7 +143,7 @@ def choose(
     statements: Statements | None = None,
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
-) -> Chosen:
+) -> Choice:
     """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
     hide those behind them in the next."""
     scores, resolution = table.detection_scores.double().numpy(), table.resolution.double().numpy()
@@ -174,14 +174,14 @@ def _accept(
     is_taken = candidates.is_certain.copy()
     for each in steps:
         is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
-    as_seen = statements.candidates_as_seen(q, is_taken)
-    stays = candidates.is_certain | np.isin(np.arange(len(candidates)), as_seen)
+    unchanged = statements.unchanged_candidates(q, is_taken)
+    stays = candidates.is_certain | np.isin(np.arange(len(candidates)), unchanged)
     leaves = np.array([each.candidate for each in steps if (is_taken | stays)[each.candidate]], np.int64)
-    certain = candidates.certain[:, leaves] | (as_seen[:, None] == leaves)
+    certain = candidates.certain[:, leaves] | (unchanged[:, None] == leaves)
     return _Ranked(q, tuple(steps), leaves, stays[leaves], certain)
 
 
-def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Chosen:
+def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Choice:
     """The leaves with their masks; one with too few of them is none, unless the user says so."""
     leaf, q = assign_masks(ranked.q[:, ranked.leaves], drawn)
     if len(ranked.leaves):
@@ -191,7 +191,7 @@ def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Chosen:
     is_left = (counts >= CHOICE.least_views) | ranked.stays
     place = np.append(np.where(is_left, is_left.cumsum() - 1, -1), -1)  # of no leaf, too
     leaf = place[leaf]
-    return Chosen(ranked.leaves[is_left], ranked.chances[is_left], leaf, q * (leaf >= 0), ranked.steps)
+    return Choice(ranked.leaves[is_left], ranked.chances[is_left], leaf, q * (leaf >= 0), ranked.steps)
 
 
 def same_class(candidates: Candidates, table: Masks) -> Bools:
@@ -251,7 +251,7 @@ def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
     """
     leaf, q_of = np.full(len(q), -1), np.zeros(len(q))
     for each in drawn if q.shape[1] else ():
-        free = np.where(q[each.rows] >= CHOICE.least_shown, q[each.rows], 0.0)
+        free = np.where(q[each.rows] >= CHOICE.least_q, q[each.rows], 0.0)
         while True:
             masks, leaves = linear_sum_assignment(free, maximize=True)
             chances = free[masks, leaves]

@@ -25,7 +25,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choice import Chosen, Statements, choose
+from mvseg.verification.choice import Choice, Statements, choose
 from mvseg.verification.evidence import Bools, Drawn, Floats, draw_views
 from mvseg.verification.leaf_scores import Candidates
 from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
@@ -68,7 +68,7 @@ def choose_leaves(
     *,
     cameras: Cameras,
     more: Sequence[Masks] = (),
-    gone: Masks | None = None,
+    removed: Masks | None = None,
     previous: Tensor | None = None,
     drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
@@ -85,8 +85,8 @@ def choose_leaves(
         matched: D masks, matched; `labels` of detected ones are rows of `proposals`.
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
         more: masks of other matchings, of more of the proposals, with such labels, too.
-        gone: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the user's
-            masks are candidates here, and `more` has the others.
+        removed: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the
+            user's masks are candidates here, and `more` has the others.
         previous: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1
         elsewhere.
             None: for none.
@@ -111,14 +111,14 @@ def choose_leaves(
     table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
     statements = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
     usable = np.ones(len(table), bool)
-    if gone is not None:
+    if removed is not None:
         ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
-        others = Masks.concatenate((gone.to("cpu"), matched.select(is_held & is_added)))
+        others = Masks.concatenate((removed.to("cpu"), matched.select(is_held & is_added)))
         usable[: len(proposals)] = _without(proposals, others)
     tables = [(replace(matched, instance_ids=ids), row_of)]
     tables += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
-    is_edited = gone is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
-    has_shapes = _is_seen_around(more[0].to("cpu") if is_edited else matched, cameras)
+    is_edited = removed is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
+    has_shapes = _is_surrounded(more[0].to("cpu") if is_edited else matched, cameras)
     candidates = gather_candidates(
         tables, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache
     )
@@ -130,7 +130,7 @@ def choose_leaves(
     chosen = choose(
         candidates, table, drawn=views, usable=usable, statements=statements, min_probability=min_probability
     )
-    return _take(chosen, candidates, table, is_held=statements.is_sure)
+    return _make_leaves(chosen, candidates, table, is_held=statements.is_sure)
 
 
 def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
@@ -163,7 +163,7 @@ def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
     return is_there
 
 
-def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
+def _is_surrounded(matched: Masks, cameras: Cameras) -> bool:
     parallax = median_parallax(matched, cameras)
     if parallax < ROUGH.least_parallax:
         warn(Finding("leaves_seen_from_one_side", values={"degrees": parallax}))
@@ -256,7 +256,7 @@ def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
     return False
 
 
-def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:
+def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:
     """The table of the leaves; masks that are held (D,) and show none stay without an id."""
     rows = np.flatnonzero((chosen.leaf >= 0) | is_held)
     rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
@@ -268,7 +268,8 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
     )
     surfaces = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
-    shares = [each.shown for each in chosen.steps if each.candidate in taken and candidates.has_surface[each.candidate]]
+    accepted = [each for each in chosen.steps if each.candidate in taken]
+    shares = [each.shown_share for each in accepted if candidates.has_surface[each.candidate]]
     return Leaves(
         masks=masks,
         surfaces={number: each for number, each in enumerate(surfaces, 1) if each is not None and each.is_credible},

@@ -28,14 +28,14 @@ class LeafScores:
         shows: weights for a mask to show a candidate with a surface: see `shows_features`.
         matched: the same for a candidate without one: see `matched_features`.
         leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
-        found: the same for a candidate without one, by the first four of these features.
+        leaf_matched: the same for a candidate without one, by the first four of these features.
         finer: log odds that a mask shows a candidate gain per logarithm of `Masks.resolution`.
     """
 
     shows: dict[str, float]
     matched: dict[str, float]
     leaf: dict[str, float]
-    found: dict[str, float]
+    leaf_matched: dict[str, float]
     finer: float
 
 
@@ -44,7 +44,7 @@ FITTED = LeafScores(
     shows={"always": 0.656, "detection score": 0.314, "claimed": 1.431, "visible": 0.665},
     matched={"always": -1.632, "detection score": 0.958, "match score": 0.897},
     leaf={"always": -2.385, "shown": 4.382, "number": 0.913, "detection score": 1.153, "length": 1.157, "fit": 0.387},
-    found={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
+    leaf_matched={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
     finer=1.0,
 )
 
@@ -149,7 +149,7 @@ def matched_features(matched: Floats, scores: Floats) -> Floats:
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(K,) P: how likely each candidate is a leaf, and no stem; 1 where the user says so."""
     by_surface = expit(features @ list(fitted.leaf.values()))
-    by_masks = expit(features[:, : len(fitted.found)] @ list(fitted.found.values()))
+    by_masks = expit(features[:, : len(fitted.leaf_matched)] @ list(fitted.leaf_matched.values()))
     chances: Floats = np.where(candidates.has_surface, by_surface * (1 - candidates.stem), by_masks)
     return np.where(candidates.is_certain, 1.0, chances)
 

@@ -31,8 +31,8 @@ class RoughNumbers:
 class PartNumbers:
     """Masks that show two leaves."""
 
-    each: float = 0.2  # chosen: fraction of a mask that each of the two leaves it shows covers, at least
-    both: float = 0.7  # chosen: and both together
+    least_each: float = 0.2  # chosen: fraction of a mask that each of the two leaves it shows covers, at least
+    least_both: float = 0.7  # chosen: and both together
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ChoiceNumbers:
     given: float = 0.95  # chosen: score of a given mask, as if a detector had found it
     some: float = 0.1  # definition: number of masks that is added before the logarithm, a feature of P
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
-    least_shown: float = 0.2  # chosen: q from which a mask may show a leaf
+    least_q: float = 0.2  # chosen: q from which a mask may show a leaf
     least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
 

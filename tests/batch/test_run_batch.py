@@ -232,7 +232,7 @@ def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
     finally:
         stop.set()
         thread.join()
-    assert counts == BatchCounts(done=1, kept=0, failed=1, warned=1)  # of mint, whose two views are far apart
+    assert counts == BatchCounts(done=1, resumed=0, failed=1, warned=1)  # of mint, whose two views are far apart
     (failure,) = read_table(out / "tables" / "failures.csv")
     assert failure["sentence"] == (
         "the process that worked on this scene died, most likely because memory ran out, twice"

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from blade_scene import as_regions
-from mvseg.corrections.as_seen import leave_joined, leaves_as_seen, seen_ids
 from mvseg.corrections.corrected import Corrected, Whole
+from mvseg.corrections.unchanged_leaves import ids_before, leave_joined, unchanged_leaves
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
 from three_leaves import true_maps
@@ -25,7 +25,7 @@ NAMED = replace(BEFORE, is_linked=torch.ones(len(IDS), dtype=torch.bool))
 def stay(masks: Masks = NAMED, before: Masks = BEFORE, *, whole: tuple[Whole, ...] = (), **links: object) -> list[int]:
     said = Links.of(**links)  # type: ignore[arg-type]
     edited = Corrected(masks, said, torch.zeros(len(masks)), whole, (), ())
-    return leaves_as_seen(edited, seen_ids(masks, before), before).tolist()
+    return unchanged_leaves(edited, ids_before(masks, before), before).tolist()
 
 
 def test_what_says_what_is_seen_changes_no_leaf() -> None:
@@ -33,7 +33,7 @@ def test_what_says_what_is_seen_changes_no_leaf() -> None:
     assert stay(must=[(ONE[0], ONE[2])], cannot=[(ONE[1], TWO[1])], whole=(Whole(1, THREE[0], False),)) == [1, 2, 3]
     assert stay(replace(BEFORE, is_linked=torch.arange(len(IDS)) == TWO[1])) == [2]
     order = torch.randperm(len(IDS), generator=torch.Generator().manual_seed(0))
-    assert seen_ids(BEFORE.select(order), BEFORE).tolist() == IDS[order].tolist()
+    assert ids_before(BEFORE.select(order), BEFORE).tolist() == IDS[order].tolist()
 
 
 @pytest.mark.parametrize(

@@ -81,5 +81,5 @@ def test_doubtful_shapes_are_named_and_an_area_has_the_digits_that_are_known(res
         findings=(Finding("doubtful_shapes", values={"count": 2, "total": 12, "leaves": ("2", "8")}, level="note"),),
     )
     card = make_card(measured, OUT)
-    assert card.found == "12 leaves in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2"
+    assert card.summary == "12 leaves in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2"
     assert str(card.doubt) == "the shapes of 2 of 12 leaves are doubtful (2, 8): the page says why"

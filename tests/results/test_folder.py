@@ -22,7 +22,7 @@ import mvseg.results.report.page
 from known_leaves import bent_blade
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.evaluation.truth import shown_instances
+from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.scene_folder import load_masks
@@ -220,7 +220,7 @@ class TestContent:
 
     def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
         regions, truth = read_instances(saved, plant / "truth")
-        ids, true = regions.labels, shown_instances(regions, truth)
+        ids, true = regions.labels, true_instances(regions, truth)
         assert len(ids) == len(true) == 12
         assert len({*zip(ids.tolist(), true.tolist(), strict=True)}) == 3
         assert set(true.tolist()) == {1, 2, 3}

@@ -9,7 +9,7 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, make_poses
-from mvseg.tracking.associate import Association, join_sights, link_leaves
+from mvseg.tracking.associate import Association, join_observations, link_leaves
 from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.place_dates import chain_dates
 
@@ -50,7 +50,7 @@ def gain_of(tracks: np.ndarray | list[int], gains: np.ndarray) -> float:
 def test_no_parting_is_better(seed: int) -> None:
     gains, date_of, _ = draw_gains([2, 3, 2, 2], seed, noise=3.0)
     best = max(gain_of(tracks, gains) for tracks in every_partition(date_of))
-    found = join_sights(gains, date_of)
+    found = join_observations(gains, date_of)
     assert gain_of(found, gains) == pytest.approx(best, rel=0.02)
     for date in range(4):
         assert len(set(found[date_of == date])) == (date_of == date).sum()
@@ -58,7 +58,7 @@ def test_no_parting_is_better(seed: int) -> None:
 
 def test_leaves_that_are_alike_are_one_track() -> None:
     gains, date_of, leaf = draw_gains([5, 7, 6, 7, 4], 3, noise=0.5)
-    tracks = join_sights(gains, date_of)
+    tracks = join_observations(gains, date_of)
     assert ((tracks[:, None] == tracks) == (leaf[:, None] == leaf)).all()
 
 

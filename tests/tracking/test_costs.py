@@ -11,7 +11,7 @@ from mvseg.tracking.align import Alignment, best_pairs, refine_alignment
 from mvseg.tracking.bent_costs import bend, bent_costs
 from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, fitted_costs, size_costs
 from mvseg.tracking.leaves import Pair, leaves_of
-from mvseg.tracking.numbers import COSTS, LINKING, SIGHTS
+from mvseg.tracking.numbers import COSTS, LINKING, OBSERVATIONS
 from tests.plants_over_days import Blades, grow_blades, see
 
 
@@ -94,7 +94,7 @@ def test_few_pairs_hardly_move_the_costs_and_many_that_agree_narrow_them() -> No
 
 def test_a_leaf_of_which_half_is_seen_lies_on_the_whole_one() -> None:
     pair, there = pair_of(grow_blades(7, 2), grow_blades(7, 2))
-    half = pair.second.points[:, SIGHTS.cloud // 2 :].repeat(2, axis=1)
+    half = pair.second.points[:, OBSERVATIONS.cloud // 2 :].repeat(2, axis=1)
     part = replace(pair, second=replace(pair.second, points=half))
     near = Differences.of(part, cloud=True).near
     assert near is not None

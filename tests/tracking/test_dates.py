@@ -15,7 +15,7 @@ from known_leaves import make_surface
 from mvseg import load_result
 from mvseg.errors import InputError
 from mvseg.tracking.dates import Number, date_of, name_apart, order_dates, read_date, read_time
-from mvseg.tracking.numbers import SIGHTS
+from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.nodes import UNCLEAR, Node, Stem, thin_tube
@@ -116,7 +116,7 @@ def test_results_are_read(tmp_path: Path) -> None:
     assert date.whole["total_leaf_area"].value == 5000
     midrib = date.leaves[0].midrib
     assert midrib is not None
-    assert midrib.shape == (SIGHTS.stations, 3)
+    assert midrib.shape == (OBSERVATIONS.stations, 3)
     np.testing.assert_allclose(midrib[[0, -1]], blades[1][[0, -1], 1], atol=1.5)
 
 

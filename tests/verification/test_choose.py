@@ -142,7 +142,7 @@ def test_a_person_is_right() -> None:
     rest = torch.arange(len(IDS)) != row
     gone = PROPOSALS.select(~rest)
     matched = matched_of(PROPOSALS, IDS[rest], rest.nonzero()[:, 0])
-    without = choose(matched, gone=gone, more=(matched,))
+    without = choose(matched, removed=gone, more=(matched,))
     assert len(without.masks) == len(REGIONS) - 1
     boxes = without.masks.regions.boxes[without.masks.view_index == 2]
     assert not (boxes == REGIONS.boxes[row]).all(1).any()
@@ -153,7 +153,7 @@ def test_an_edit_that_touches_nothing_changes_nothing() -> None:
     matched = matched_of(PROPOSALS, IDS)
     plain = choose(matched)
     moved = replace(matched, instance_ids=IDS % 3 + 1)  # what the edited masks are matched to does not matter
-    edited = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched,))
+    edited = choose(moved, removed=PROPOSALS.select(IDS < 0), more=(matched,))
     assert plain.probabilities == edited.probabilities
     assert torch.equal(plain.masks.instance_ids, edited.masks.instance_ids)
     assert torch.equal(plain.masks.match_scores, edited.masks.match_scores)
@@ -196,7 +196,7 @@ def test_what_is_said_of_a_leaf_that_stays_as_it_was_seen_changes_no_other_mask(
     """Bit for bit, but that the mask is certain now, and the leaf."""
     plain = choose(matched_of(PROPOSALS, IDS))
     moved = said_of(3, IDS % 3 + 1)
-    same = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), previous=IDS)
+    same = choose(moved, removed=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), previous=IDS)
     said = same.masks.regions.labels == 3
     (leaf,) = same.masks.instance_ids[said].tolist()
     assert torch.equal(plain.masks.regions.labels, same.masks.regions.labels)
@@ -215,7 +215,7 @@ def test_a_cut_mask_of_a_leaf_that_stays_as_it_was_seen_stays_in_it() -> None:
     first = matched_of(PROPOSALS, IDS)
     cut = replace(first, regions=replace(as_regions(maps)[0], labels=torch.arange(len(IDS))))
     cut.origin[row] = Origin.CONFIRMED
-    leaves = choose(cut, gone=PROPOSALS.select(IDS < 0), more=(first,), previous=IDS)
+    leaves = choose(cut, removed=PROPOSALS.select(IDS < 0), more=(first,), previous=IDS)
     assert same_partition(leaves, maps)
 
 
@@ -227,7 +227,7 @@ def test_a_mask_that_a_person_keeps_apart_from_a_leaf_does_not_return_to_it() ->
     first = matched_of(proposals, torch.cat((IDS, torch.tensor([-1]))))
     edited = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, -1, IDS))
     edited = replace(edited, is_linked=torch.isin(torch.arange(len(IDS)), torch.tensor([row, other])))
-    leaves = choose(edited, proposals, gone=proposals.select(torch.zeros(len(proposals)) > 0), more=(first,))
+    leaves = choose(edited, proposals, removed=proposals.select(torch.zeros(len(proposals)) > 0), more=(first,))
     assert set(leaves.masks.regions.labels.tolist()) == set(range(len(IDS))) - {row}
     without = [np.where((labels == 2) & (view == 2), 0, labels) for view, labels in enumerate(TRUE)]
     assert same_partition(leaves, without)
@@ -285,7 +285,7 @@ def test_cameras_on_one_side_are_said() -> None:
         leaves = choose(matched_of(PROPOSALS, IDS), cameras=alike)
     none, more = matched_of(PROPOSALS, torch.full_like(IDS, -1)), (matched_of(PROPOSALS, IDS),)
     with pytest.warns(InputWarning, match="from one side only"):  # also where nothing was matched after an edit
-        edited = choose(none, cameras=alike, gone=PROPOSALS.select(IDS < 0), more=more)
+        edited = choose(none, cameras=alike, removed=PROPOSALS.select(IDS < 0), more=more)
     assert leaves.surfaces == edited.surfaces == {}
     assert torch.equal(leaves.masks.instance_ids, edited.masks.instance_ids)
     assert len(leaves.masks) == len(REGIONS)

@@ -64,7 +64,7 @@ def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world
     around = cv2.medianBlur(lab, 2 * THIN.around_px + 1)
     apart = np.sqrt(((lab.astype(np.float32) - around) ** 2).sum(2))
     noise = float(np.median(apart[~hidden])) if not hidden.all() else 0.0
-    share = np.clip((apart - THIN.quiet * noise) / (THIN.sure * noise + THIN.least_apart), 0, 1)
+    share = np.clip((apart - THIN.quiet * noise) / (THIN.surely * noise + THIN.least_apart), 0, 1)
     matrix = px_from_world.copy()
     matrix[:2] -= low[:, None] * matrix[2]
     matrix[:2] *= np.array([[width / (high[0] - low[0])], [height / (high[1] - low[1])]])

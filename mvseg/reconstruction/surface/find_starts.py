@@ -31,7 +31,7 @@ def find_starts(stacks: Sequence[MaskStack], *, is_rough: bool) -> list[tuple[Ma
     """
     turned = [_carve(masks.turn_world(masks.axes)) for masks in stacks]
     few = [_few_views(masks, hull.points.mean(0)) if len(hull.points) else masks for masks, hull in turned]
-    ranked = dict.fromkeys(range(len(stacks)), _Found())
+    ranked = dict.fromkeys(range(len(stacks)), _MovedStarts())
     for is_strict in (True, False):
         searched = [index for index, (_, hull) in enumerate(turned) if len(hull.points) and not ranked[index].is_good]
         likely = {}
@@ -70,7 +70,7 @@ def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _MovedStarts:
     """Patches that were moved to the masks, with their scores; does one explain the masks; the best score half way."""
 
     patches: tuple[Floats, ...] = ()
@@ -92,8 +92,8 @@ class _Found:
 
 
 def _try_starts(
-    tried: Mapping[int, list[Floats]], few: Sequence[MaskStack], best: Mapping[int, _Found]
-) -> dict[int, _Found]:
+    tried: Mapping[int, list[Floats]], few: Sequence[MaskStack], best: Mapping[int, _MovedStarts]
+) -> dict[int, _MovedStarts]:
     """What is found of the leaves that are tried: their starts moved half the way to the masks, and those of them all
     of the way that may become the best."""
     if not tried:
@@ -116,7 +116,7 @@ def _try_starts(
     answers = {}
     for index in tried:
         before, own = best[index], leaf[goes_on] == index
-        answers[index] = _Found(
+        answers[index] = _MovedStarts(
             patches=(*before.patches, *patches[own]),
             scores=(*before.scores, *ends[own].tolist()),
             is_good=before.is_good or bool(is_good[own].any()),

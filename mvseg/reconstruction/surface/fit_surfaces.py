@@ -305,7 +305,7 @@ def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
     is_open = (masks.look_up(masks.others, stack, px) == 0).reshape(len(masks), -1)
     is_inside = masks.look_up(masks.inside, stack, px).reshape(len(masks), -1)
     shown = (is_inside & is_open).sum(0) / np.maximum(is_open.sum(0), 1)
-    unshown = float(areas[shown < DOUBTS.shown].sum() / areas.sum())
+    unshown = float(areas[shown < DOUBTS.least_shown].sum() / areas.sum())
     if unshown > DOUBTS.most_unshown:
         reasons["lobed"] = f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes"
     along = np.linalg.norm(np.diff(points[:, points.shape[1] // 2], axis=0), axis=-1).cumsum()

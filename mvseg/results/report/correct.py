@@ -1,4 +1,4 @@
-"""What the page needs to correct a result: where its pictures are in the user's photos, its name, and the doubts."""
+"""What the page needs to correct a result: where its pictures are in the user's photos, its name, and the questions."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.corrections.corrected import APPLIED, PASSED, Fate
-from mvseg.corrections.doubtful import Doubt, list_doubts
 from mvseg.corrections.file import dump_edits, name_edits
+from mvseg.corrections.mask_questions import MaskQuestion, list_mask_questions
 from mvseg.corrections.same_scene import mark_photos
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.photos import Photos
@@ -44,7 +44,7 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
             {"size": size, "lens": lens}
             for size, lens in zip(result.scene.cameras.sizes.tolist(), of_view, strict=True)
         ],
-        "doubts": describe_doubts(result, pictures),
+        "doubts": describe_questions(result, pictures),
     }
 
 
@@ -93,24 +93,26 @@ def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None
     return lenses, of_view
 
 
-def describe_doubts(result: Result, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
+def describe_questions(result: Result, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
     """The queue; outlines in units of the pictures."""
     cameras = result.scene.cameras.to("cpu")
     photos = result.photos if result.photos is not None and result.photos.exist else None
     return [
-        _describe_doubt(doubt, pictures, cameras.sizes.tolist())
-        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected,
+        _describe_question(question, pictures, cameras.sizes.tolist())
+        for question in list_mask_questions(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected,
         photos=photos)
     ]
 
 
-def _describe_doubt(doubt: Doubt, pictures: Sequence[Picture], sizes: Sequence[Sequence[int]]) -> dict[str, Any]:
+def _describe_question(
+    question: MaskQuestion, pictures: Sequence[Picture], sizes: Sequence[Sequence[int]]
+) -> dict[str, Any]:
     outlines = []
-    for view, outline in doubt.outlines:
+    for view, outline in question.outlines:
         size = sizes[view]
         left, top, right = (share * side for share, side in zip(pictures[view].box[:3], [*size, size[0]], strict=True))
         points = np.round((outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
         outlines.append({"view": view, "outline": points})
-    said = asdict(doubt) | {"doubt": round(doubt.doubt, 3), "leaf": doubt.instance, "outlines": outlines}
+    said = asdict(question) | {"doubt": round(question.doubt, 3), "leaf": question.instance, "outlines": outlines}
     del said["instance"], said["size"]
     return said

@@ -16,7 +16,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from mvseg.results.report.correct import describe_correct, describe_doubts
+from mvseg.results.report.correct import describe_correct, describe_questions
 from mvseg.results.report.leaves import describe_leaves, describe_traits
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
@@ -100,7 +100,7 @@ def describe_update(result: Result, pictures: Sequence[Picture]) -> dict[str, An
     return {
         "views": [{"masks": masks} for masks in describe_masks(result, pictures)],
         "leaves": describe_leaves(result),
-        "doubts": describe_doubts(result, pictures),
+        "doubts": describe_questions(result, pictures),
         "numMasks": len(result.regions),
     }
 

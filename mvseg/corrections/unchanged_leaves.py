@@ -12,7 +12,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
 
 
-def name_each(regions: Regions) -> list[str]:
+def name_regions(regions: Regions) -> list[str]:
     """A name of each of D regions by view and pixels: regions have the same name only if they are equal."""
     regions = regions.to("cpu")
     places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
@@ -20,19 +20,19 @@ def name_each(regions: Regions) -> list[str]:
     return [f"{view} {box} {digest}" for (view, box), digest in zip(places, pixels, strict=True)]
 
 
-def seen_ids(masks: Masks, before: Masks) -> Tensor:
+def ids_before(masks: Masks, before: Masks) -> Tensor:
     """(D,) int64, the ids that the user saw: those of the same masks before edits; -1 for those that were not there."""
-    known = dict(zip(name_each(before.regions), before.instance_ids.tolist(), strict=True))
-    return torch.tensor([known.get(name, -1) for name in name_each(masks.regions)], dtype=torch.int64)
+    known = dict(zip(name_regions(before.regions), before.instance_ids.tolist(), strict=True))
+    return torch.tensor([known.get(name, -1) for name in name_regions(masks.regions)], dtype=torch.int64)
 
 
-def leaves_as_seen(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
+def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
     """Find the leaves that edits are about and leave as they are: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.
 
     Args:
         corrected: D masks and their links.
-        ids: (D,) int64, their `seen_ids`.
+        ids: (D,) int64, their `ids_before`.
         before: the masks before the edits, on the CPU, with the ids that the user saw.
 
     Returns:

@@ -11,8 +11,8 @@ import torch
 
 from blade_scene import as_regions
 from known_leaves import make_surface
-from mvseg.corrections.doubtful import Doubt, best_mask, list_doubts
-from mvseg.corrections.numbers import DOUBTS
+from mvseg.corrections.mask_questions import MaskQuestion, best_mask, list_mask_questions
+from mvseg.corrections.numbers import QUESTIONS
 from mvseg.masks import Masks, Origin
 from mvseg.verification.choose import RejectedCandidate
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -27,8 +27,8 @@ def masks_of(maps: list[np.ndarray]) -> Masks:
     return Masks.of(regions, ids, torch.where(ids > 0, 0.95, 0.0))
 
 
-def doubts(masks: Masks, **changes: object) -> list[Doubt]:
-    return list_doubts(masks, LEAVES, cameras=CAMERAS, **changes)  # type: ignore[arg-type]
+def doubts(masks: Masks, **changes: object) -> list[MaskQuestion]:
+    return list_mask_questions(masks, LEAVES, cameras=CAMERAS, **changes)  # type: ignore[arg-type]
 
 
 def row_of(masks: Masks, *, view: int, leaf: int) -> int:
@@ -49,7 +49,7 @@ def test_nothing_is_asked_of_a_result_without_faults() -> None:
 def test_low_scores_come_first_the_lowest_before_the_others() -> None:
     masks = masks_of(TRUE)
     rows = [row_of(masks, view=view, leaf=leaf) for view, leaf in ((1, 2), (4, 3), (0, 1))]
-    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - DOUBTS.least + 0.01])
+    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - QUESTIONS.least + 0.01])
     found = doubts(masks)
     assert [(each.kind, each.view, each.instance, each.region) for each in found] == [
         ("match", 4, 3, rows[1]), ("match", 1, 2, rows[0])
@@ -97,7 +97,7 @@ def test_a_leaf_of_few_views_is_asked_about_once() -> None:
 
 def test_without_surfaces_every_view_should_show_a_leaf() -> None:
     maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
-    found = list_doubts(masks_of(maps), None, cameras=CAMERAS)
+    found = list_mask_questions(masks_of(maps), None, cameras=CAMERAS)
     assert [(each.kind, each.instance, each.found, each.expected) for each in found] == [("few", 3, 2, 6)]
 
 
@@ -106,7 +106,7 @@ def test_the_mask_that_its_surface_explains_worst_is_asked_about() -> None:
     iou[4] = 0.4
     surfaces = LEAVES | {2: replace(make_surface(LEAVES[2].coefficients.numpy()), iou=iou)}
     masks = masks_of(TRUE)
-    (found,) = list_doubts(masks, surfaces, cameras=CAMERAS)
+    (found,) = list_mask_questions(masks, surfaces, cameras=CAMERAS)
     assert (found.kind, found.view, found.region) == ("surface", 4, row_of(masks, view=4, leaf=2))
     assert found.doubt == pytest.approx(0.6)
 
@@ -122,8 +122,8 @@ def test_what_a_person_said_is_not_asked_again() -> None:
 
 def test_no_masks_and_no_surfaces_are_no_doubts() -> None:
     empty = masks_of([np.zeros_like(labels) for labels in TRUE])
-    assert list_doubts(empty, None, cameras=CAMERAS) == []
-    assert {each.kind for each in list_doubts(masks_of(TRUE), {}, cameras=CAMERAS)} == set()
+    assert list_mask_questions(empty, None, cameras=CAMERAS) == []
+    assert {each.kind for each in list_mask_questions(masks_of(TRUE), {}, cameras=CAMERAS)} == set()
 
 
 def test_the_best_mask_is_the_largest_of_the_sure_ones() -> None:
@@ -150,7 +150,7 @@ def without(leaf: int) -> Masks:
 
 def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
-    found = list_doubts(without(2), surfaces, cameras=CAMERAS, rejected=(leave_out(2, 0.4, 0, 2, 4),))
+    found = list_mask_questions(without(2), surfaces, cameras=CAMERAS, rejected=(leave_out(2, 0.4, 0, 2, 4),))
     (asked,) = [each for each in found if each.kind == "leaf"]
     assert sorted(view for view, _ in asked.outlines) == [0, 2, 4]
     assert (asked.view, asked.region, asked.instance) == (asked.outlines[0][0], -1, -1)
@@ -164,13 +164,13 @@ def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
 def test_unlikely_candidates_those_of_one_view_and_those_that_have_masks_are_not_asked_about() -> None:
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
     left = leave_out(2, 0.09, 0, 2, 4), leave_out(2, 0.5, 3), leave_out(1, 0.5, 0, 1, 2)
-    assert list_doubts(without(2), surfaces, cameras=CAMERAS, rejected=left) == []
+    assert list_mask_questions(without(2), surfaces, cameras=CAMERAS, rejected=left) == []
 
 
 def test_what_is_likelier_and_larger_is_asked_first() -> None:
     nothing = masks_of([np.where(labels == 1, labels, 0) for labels in TRUE])
     left = leave_out(3, 0.2, 0, 1), leave_out(2, 0.4, 0, 1)
-    found = [each for each in list_doubts(nothing, None, cameras=CAMERAS, rejected=left) if each.kind == "leaf"]
+    found = [each for each in list_mask_questions(nothing, None, cameras=CAMERAS, rejected=left) if each.kind == "leaf"]
     assert [each.doubt for each in found] == sorted((each.doubt for each in found), reverse=True)
     assert len(found) == 2
 
@@ -184,7 +184,8 @@ def test_large_places_that_look_like_leaves_come_first() -> None:
     photos = [np.where((labels == 1)[..., None], BROWN, photo) for labels, photo in zip(TRUE, PHOTOS, strict=True)]
     masks = masks_of(maps).close_gaps()
     masks.match_scores[0] = 0.01
-    first, *others = list_doubts(masks, None, cameras=CAMERAS, photos=[p.astype(np.uint8) for p in photos].__getitem__)
+    read = [photo.astype(np.uint8) for photo in photos].__getitem__
+    first, *others = list_mask_questions(masks, None, cameras=CAMERAS, photos=read)
     assert (first.kind, first.instance, first.region) == ("place", -1, -1)
     assert [each.kind for each in others] == ["match"]
     assert len(first.outlines) >= 4
@@ -194,7 +195,7 @@ def test_large_places_that_look_like_leaves_come_first() -> None:
     sizes = [cv2.contourArea(outline.astype(np.float32)) for _, outline in first.outlines]
     assert sizes == sorted(sizes, reverse=True)
     photos[1:] = [np.where(photo == GREEN, BROWN, photo) for photo in photos[1:]]
-    found = list_doubts(masks, None, cameras=CAMERAS, photos=[p.astype(np.uint8) for p in photos].__getitem__)
+    found = list_mask_questions(masks, None, cameras=CAMERAS, photos=[p.astype(np.uint8) for p in photos].__getitem__)
     assert "place" not in {each.kind for each in found}  # nothing that one photo shows becomes a leaf
 
 
@@ -210,12 +211,12 @@ def halved(views: tuple[int, ...]) -> Masks:
 
 def test_half_masks_of_a_leaf_are_one_question() -> None:
     views = tuple(view for view, labels in enumerate(TRUE) if (labels == 2).sum() > 0.5 * (TRUE[0] == 2).sum())
-    found = list_doubts(halved(views), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
+    found = list_mask_questions(halved(views), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
     half = [each for each in found if each.kind == "half"]
     assert [(each.instance, each.found >= 3) for each in half] == [(2, True)]
     assert found[0] is half[0]
     assert {view for view, _ in half[0].outlines} <= {*views}
-    few = list_doubts(halved(views[:2]), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
+    few = list_mask_questions(halved(views[:2]), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
     assert {each.kind for each in few} <= {"place"}
 
 
@@ -225,7 +226,7 @@ def test_what_changes_more_masks_is_asked_first() -> None:
     masks = masks_of(maps)
     row = row_of(masks, view=4, leaf=2)
     masks.match_scores[row] = 0.3
-    found = list_doubts(masks, None, cameras=CAMERAS)
+    found = list_mask_questions(masks, None, cameras=CAMERAS)
     assert [each.kind for each in found] == ["few", "match"]
     assert found[0].doubt < found[1].doubt
 
@@ -239,7 +240,7 @@ def test_the_widest_place_of_leaves_that_hang_together_is_asked_about() -> None:
         row = int(np.nonzero(labels == 1)[0].mean())
         painted[row - 4 : row + 4][labels[row - 4 : row + 4] == 0] = GREEN
         photos.append(painted)
-    found = list_doubts(masks_of(bare), None, cameras=CAMERAS, photos=photos.__getitem__)
+    found = list_mask_questions(masks_of(bare), None, cameras=CAMERAS, photos=photos.__getitem__)
     assert found[0].kind in ("place", "half")  # it lies beside another leaf
     for view, outline in found[0].outlines:
         inside = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline).astype(np.int32)], 1) > 0

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
-from mvseg.corrections.numbers import DOUBTS
+from mvseg.corrections.numbers import QUESTIONS
 from mvseg.corrections.unmasked import Unmasked, find_unmasked
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
@@ -33,7 +33,7 @@ Outlines = tuple[tuple[int, NDArray[np.float64]], ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Doubt:
+class MaskQuestion:
     """One question to the user.
 
     Attributes:
@@ -69,19 +69,19 @@ class Doubt:
     @property
     def change(self) -> float:
         """How many usual masks an answer is expected to change."""
-        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), DOUBTS.digits)
+        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), QUESTIONS.digits)
 
 
-def list_doubts(
+def list_mask_questions(
     masks: Masks,
     surfaces: Mapping[int, LeafSurface] | None,
     *,
     cameras: Cameras,
     rejected: Sequence[RejectedCandidate] = (),
     photos: ReadPhoto | None = None,
-) -> list[Doubt]:
-    """List places that the user should look at, at most `DOUBTS.most`: first places without masks and half masks, then
-    what an answer is expected to change most (`Doubt.change`); masks that the user made or confirmed are not asked
+) -> list[MaskQuestion]:
+    """List questions about masks, at most `QUESTIONS.most`: first places without masks and half masks, then those whose
+    answer is expected to change most (`MaskQuestion.change`). Masks that the user made or confirmed are not asked
     about, and every other mask once.
 
     Args:
@@ -89,7 +89,7 @@ def list_doubts(
         photos: photos of the views; None: nobody looks for places without masks.
     """
     masks, surfaces_of, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
-    doubts = _doubt_matches(masks)
+    questions = _ask_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
     evidence = see_instances(masks.regions, surfaces_of, cameras)
     free: list[list[int]] = [[] for _ in rejected]  # rows of each candidate's masks where none of the result lies
@@ -97,32 +97,34 @@ def list_doubts(
         taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
         if surfaces_of:
             painted = paint_view(surfaces_of, cameras, view)
-            doubts += _doubt_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
+            questions += _ask_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
         for rows, candidate in zip(free, rejected, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
-    doubts += _doubt_surfaces(masks, surfaces_of) + _doubt_rare(masks, should)
+    questions += _ask_surfaces(masks, surfaces_of) + _ask_rare(masks, should)
     usual, areas = _usual_area(masks), masks.regions.areas.tolist()
     if photos is not None:
-        doubts += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=DOUBTS.half * usual), usual=usual)
-    doubts = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in doubts]
+        questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=QUESTIONS.half * usual), usual=usual)
+    questions = [
+        replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in questions
+    ]
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
-    queue = _doubt_left(rejected, free, usual=usual)
+    queue = _ask_rejected(rejected, free, usual=usual)
     place = attrgetter("view", "instance", "region")
-    for each in sorted(doubts, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
+    for each in sorted(questions, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
-        if each.doubt >= DOUBTS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
+        if each.doubt >= QUESTIONS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
             queue.append(each)
     queue.sort(key=_order)
     return [
         each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
-        for each in queue[: DOUBTS.most]
+        for each in queue[: QUESTIONS.most]
     ]
 
 
-def _order(doubt: Doubt) -> tuple[bool, float]:
-    return doubt.kind not in FIRST, -doubt.change
+def _order(question: MaskQuestion) -> tuple[bool, float]:
+    return question.kind not in FIRST, -question.change
 
 
 def best_mask(masks: Masks, instance: int, *, but: int) -> int:
@@ -132,21 +134,21 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
     if not len(rows):
         return -1
     scores = masks.match_scores[rows]
-    return int(rows[torch.where(scores >= scores.max() - DOUBTS.as_good, masks.regions.areas[rows], -1).argmax()])
+    return int(rows[torch.where(scores >= scores.max() - QUESTIONS.as_good, masks.regions.areas[rows], -1).argmax()])
 
 
-def _doubt_matches(masks: Masks) -> list[Doubt]:
+def _ask_matches(masks: Masks) -> list[MaskQuestion]:
     """Low match scores; and masks of some size that were matched to nothing."""
     ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
     usual = _usual_area(masks)
-    doubts = []
+    questions = []
     for row, score in enumerate(masks.match_scores.tolist()):
         if ids[row] > 0:
-            doubts.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
+            questions.append(MaskQuestion("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
             doubt = min(1.0, float(areas[row]) / usual)
-            doubts.append(Doubt("unmatched", doubt, views[row], -1, region=row))
-    return doubts
+            questions.append(MaskQuestion("unmatched", doubt, views[row], -1, region=row))
+    return questions
 
 
 def _usual_area(masks: Masks) -> float:
@@ -155,31 +157,32 @@ def _usual_area(masks: Masks) -> float:
     return max(float(matched.median()), 1.0) if len(matched) else 1.0
 
 
-def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> list[Doubt]:
+def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> list[MaskQuestion]:
     """Large places without masks, all in one question, if two views have such; and leaves beside whose masks there are
     such places in several views, a question each."""
     ids, areas, drawn = masks.instance_ids.tolist(), masks.regions.areas.tolist(), masks.is_corrected.tolist()
     places, halves = [], defaultdict[int, dict[int, Unmasked]](dict)
     for part in sorted(parts, key=lambda one: (-one.area, one.view)):
-        if part.row >= 0 and ids[part.row] > 0 and not drawn[part.row] and part.area >= DOUBTS.half * areas[part.row]:
+        is_beside = part.row >= 0 and ids[part.row] > 0 and not drawn[part.row]
+        if is_beside and part.area >= QUESTIONS.half * areas[part.row]:
             halves[ids[part.row]].setdefault(part.view, part)
         if part.area >= usual:
             places.append(part)
-    doubts = []
+    questions = []
     for instance, views in sorted(halves.items()):
-        if len(views) < DOUBTS.least_halves:
+        if len(views) < QUESTIONS.least_halves:
             continue
         places = [part for part in places if part.row < 0 or ids[part.row] != instance]
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
-        doubts.append(
-            Doubt("half", 1.0, largest.view, instance, region=largest.row, found=len(views),
+        questions.append(
+            MaskQuestion("half", 1.0, largest.view, instance, region=largest.row, found=len(views),
                   expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
         )  # fmt: skip
     if len({part.view for part in places}) > 1:  # two outlines are a leaf
-        outlines = tuple((part.view, part.outline) for part in places[: DOUBTS.most_places])
-        doubts.append(Doubt("place", 1.0, outlines[0][0], -1, outlines=outlines))
-    return doubts
+        outlines = tuple((part.view, part.outline) for part in places[: QUESTIONS.most_places])
+        questions.append(MaskQuestion("place", 1.0, outlines[0][0], -1, outlines=outlines))
+    return questions
 
 
 def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
@@ -192,12 +195,14 @@ def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
     return free
 
 
-def _doubt_left(rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[int]], *, usual: float) -> list[Doubt]:
+def _ask_rejected(
+    rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[int]], *, usual: float
+) -> list[MaskQuestion]:
     """Candidates that were not chosen, in the views where no mask of the result lies, the largest mask first; `usual`
     as `_usual_area` says."""
-    doubts = []
+    questions = []
     for each, rows in zip(rejected, free, strict=True):
-        if each.chance < DOUBTS.least_chance or len(rows) < CHOICE.least_views:
+        if each.chance < QUESTIONS.least_chance or len(rows) < CHOICE.least_views:
             continue
         regions = each.masks.regions
         areas = regions.areas[rows].double()
@@ -207,13 +212,13 @@ def _doubt_left(rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[i
             for row in (rows[place] for place in order)
         )
         doubt = each.chance * min(1.0, float(areas.median()) / usual)
-        doubts.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=outlines))
-    return doubts
+        questions.append(MaskQuestion("leaf", doubt, outlines[0][0], -1, outlines=outlines))
+    return questions
 
 
-def _doubt_view(
+def _ask_view(
     masks: Masks, painted: Ints, should: Bools, *, view: int, taken: Bools, evidence: Evidence
-) -> list[Doubt]:
+) -> list[MaskQuestion]:
     """What one view should show of leaves and does not.
 
     `should` (K + 1, V) gets True where it should show one; `painted` (H, W) is from `paint_view`, `taken` (H, W) is
@@ -221,39 +226,39 @@ def _doubt_view(
     """
     members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
     here = {int(masks.instance_ids[row]) for row in members}
-    doubts = []
+    questions = []
     for instance, box in enumerate(find_objects(painted, max_label=len(should) - 1), 1):
         if box is None:
             continue
         mask, share = painted[box] == instance, float(evidence.share[view, instance])
-        if share < DOUBTS.open or mask.sum() < EVIDENCE.open_pixels:
+        if share < QUESTIONS.open or mask.sum() < EVIDENCE.open_pixels:
             continue
         should[instance, view] = True
         if instance in here:
             continue
         empty = float((mask & ~taken[box]).sum() / mask.sum())
         nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
-        if nearest >= 0 and evidence.visible[nearest, instance] >= DOUBTS.similar:
-            doubt = min(1.0, float(evidence.visible[nearest, instance]) / DOUBTS.surely)
-            doubts.append(Doubt("covered", doubt, view, instance, region=nearest))
-        elif empty >= DOUBTS.empty:
+        if nearest >= 0 and evidence.visible[nearest, instance] >= QUESTIONS.similar:
+            doubt = min(1.0, float(evidence.visible[nearest, instance]) / QUESTIONS.surely)
+            questions.append(MaskQuestion("covered", doubt, view, instance, region=nearest))
+        elif empty >= QUESTIONS.empty:
             outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
             size = min(1.0, float(mask.sum()) / _usual_area(masks))
-            doubts.append(Doubt("missing", empty * share, view, instance, outlines=outlines, size=size))
-    return doubts
+            questions.append(MaskQuestion("missing", empty * share, view, instance, outlines=outlines, size=size))
+    return questions
 
 
 def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
     """(P, 2) the largest component of a mask (h, w), cut out at a corner x, y, as a polygon; pixels."""
     lines, _ = cv2.findContours(crop.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(lines, key=cv2.contourArea)
-    points = cv2.approxPolyDP(longest, DOUBTS.smooth_px, True)[:, 0]
+    points = cv2.approxPolyDP(longest, QUESTIONS.smooth_px, True)[:, 0]
     return np.asarray(points + np.array(corner) + 0.5, dtype=np.float64)
 
 
-def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[Doubt]:
+def _ask_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[MaskQuestion]:
     """The mask of each leaf that its surface explains worst."""
-    doubts = []
+    questions = []
     for instance, surface in surfaces.items():
         if not surface.exists:
             continue
@@ -262,13 +267,13 @@ def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[D
         rows = ((masks.instance_ids == instance) & (masks.view_index == view)).nonzero()[:, 0]
         if len(rows):
             row = int(rows[masks.regions.areas[rows].argmax()])
-            doubts.append(Doubt("surface", doubt, view, instance, region=row))
-    return doubts
+            questions.append(MaskQuestion("surface", doubt, view, instance, region=row))
+    return questions
 
 
-def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
+def _ask_rare(masks: Masks, should: Bools) -> list[MaskQuestion]:
     """Leaves that were found in few of the views that should show them; without a credible surface, of all views."""
-    doubts = []
+    questions = []
     for instance in range(1, masks.num_instances + 1):
         best = best_mask(masks, instance, but=-1)
         if best < 0:
@@ -277,5 +282,5 @@ def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
         expected = views | set(np.flatnonzero(should[instance]).tolist())
         number = len(expected) if should[instance].any() else masks.regions.num_views
         doubt, view = 1 - len(views) / number, int(masks.view_index[best])
-        doubts.append(Doubt("few", doubt, view, instance, region=best, found=len(views), expected=number))
-    return doubts
+        questions.append(MaskQuestion("few", doubt, view, instance, region=best, found=len(views), expected=number))
+    return questions
