@@ -70,8 +70,8 @@ def check_ids(
         table.resolution.double().numpy(),
     )
     own = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), leaf]
-    if more := match_again(table, leaf, q=own, cameras=cameras, config=config):
-        candidates, drawn = _gather([table, *more], surfaces, cameras, is_held=is_held, cache=cache)
+    if (again := match_again(table, leaf, q=own, cameras=cameras, config=config)) is not None:
+        candidates, drawn = _gather([table, again], surfaces, cameras, is_held=is_held, cache=cache)
     is_apart = (table.is_linked & (table.instance_ids < 1)).numpy()  # an edit only says which leaf they do not show
     chosen = choose(candidates, table, drawn=drawn, usable=~is_apart)
     to = np.append(chosen.candidates, -1)[chosen.leaf]

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
@@ -22,32 +23,43 @@ from mvseg.verification.evidence import Bools, Floats, Ints
 from mvseg.verification.numbers import AGAIN
 
 
-def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config: MatchConfig) -> list[Masks]:
-    """The same masks, with the ids of those instances only that masks form which do not show their own.
+def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config: MatchConfig) -> Masks | None:
+    """Match the masks that do not show their own leaf (`AGAIN.freed`), and those without one, once more.
 
-    Such masks are freed, with those matched to nothing. All others stay together as they are, instances stay apart, and
-    no mask goes back to the one that it was taken from (`Links`).
+    All others stay together as they are, instances stay apart, and no mask goes back to the one that it was taken from
+    (`Links`).
 
     Args:
-        masks: D masks on the CPU, matched by the method "nview": with any other, or with fewer than `AGAIN.least_views`
-            views, nothing is found.
+        masks: D masks on the CPU.
         leaf: (D,) int64, what each mask was matched to, from 0 on; -1 for nothing.
         q: (D,) how likely it shows that.
         config: that the masks were matched with.
+
+    Returns:
+        The same masks with the ids of new instances only, whose masks come from several leaves; None where no mask is
+        freed, with another method than "nview", and with fewer than `AGAIN.least_views` views.
     """
-    matchings: list[Masks] = []
-    if config.resolved_method != "nview" or masks.regions.num_views < AGAIN.least_views:
-        return matchings
-    for least in AGAIN.freed:
-        is_free = (leaf < 0) | (q < least)
-        if (is_free & (leaf >= 0)).any():
-            with collect_warnings():  # the first matching has said it
-                again = match_masks(masks, cameras, config, links=_links(leaf, is_free))
-            ids = again.masks.instance_ids
-            is_old = torch.isin(ids, ids[torch.from_numpy(~is_free)])
-            if again.report.method == "nview":
-                matchings.append(replace(again.masks.with_merged(()), instance_ids=ids.where(~is_old, -1)))
-    return matchings
+    is_free = (leaf < 0) | (q < AGAIN.freed)
+    has_few_views = masks.regions.num_views < AGAIN.least_views
+    if config.resolved_method != "nview" or has_few_views or not (is_free & (leaf >= 0)).any():
+        return None
+    with collect_warnings():  # the first matching has said it
+        again = match_masks(masks, cameras, config, links=_links(leaf, is_free))
+    if again.report.method != "nview":
+        return None
+    ids = again.masks.instance_ids
+    is_old = torch.isin(ids, ids[torch.from_numpy(~is_free)]) | _comes_of_one(ids, leaf)
+    return replace(again.masks.with_merged(()), instance_ids=ids.where(~is_old, -1))
+
+
+def _comes_of_one(ids: Tensor, leaf: Ints) -> Tensor:
+    """(D,) bool, the masks of instances most of whose masks were of one leaf: that leaf again, by fewer of its
+    masks."""
+    is_one = torch.zeros(int(ids.max().clamp(min=0)) + 1, dtype=torch.bool)
+    for instance in ids[ids > 0].unique().tolist():
+        sources = leaf[(ids == instance).numpy()]
+        is_one[instance] = bool(2 * np.bincount(sources[sources >= 0], minlength=1).max() > len(sources))
+    return is_one[ids.clamp(min=0)]
 
 
 def _links(leaf: Ints, is_free: Bools) -> Links:

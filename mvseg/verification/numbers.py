@@ -40,8 +40,7 @@ class AgainNumbers:
     """Masks that are matched again."""
 
     least_views: int = 5  # chosen: of fewer, surfaces fit wrong masks as well: two always agree
-    # In turn, those that show another leaf as likely as not, and all that are not sure.
-    freed: tuple[float, ...] = (0.5, 0.75)  # chosen: q of masks for their own leaf below which they are freed
+    freed: float = 0.5  # definition: q of a mask for its own leaf below which it likelier shows another one
 
 
 @dataclass(frozen=True)
