@@ -19,7 +19,7 @@ from mvseg.regions import Regions, stack_regions
 
 T = TypeVar("T")
 
-SURE = 0.5  # definition: match score from which a mask counts for its instance's support
+SURE = 0.5  # definition: match score, or q, from which a mask likelier shows an instance than not
 COLUMNS = (  # that are tensors
     "instance_ids",
     "match_scores",

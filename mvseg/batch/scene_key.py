@@ -10,34 +10,35 @@ from pathlib import Path
 from typing import Any
 
 from mvseg._version import code_hash
-from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.formats.masks.yolo import name_files
+from mvseg.runs.request import RunRequest
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 
 
-def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, corrections: Path | None = None) -> str:
-    """The hash of a scene's inputs and options.
+def scene_key(scene: Scene, request: RunRequest) -> str:
+    """The hash of a scene's inputs and of the options of a request.
 
     It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
-    reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
-    files. Hidden files are ignored. Without `masks`, a detector finds them.
+    reading gigabytes; without masks, the detector's weights, and those that another plant taught; all options and
+    mvseg's code; but not the paths of the files. Hidden files are ignored.
 
     Raises:
         InputError: a file cannot be read, or the weights are not there.
     """
-    options = asdict(config)
+    options, masks = asdict(request.config), request.masks
     try:
         if masks is None:
             from mvseg.detectors.zoo import weights_path  # loads torchvision
 
             options["detect"]["weights"] = None  # their hash counts, not their name
-            others: Any = hash_files(weights_path(config.detect.weights))
+            weights = (Path(weights_path(request.config.detect.weights)), request.taught)
+            others: Any = [None if path is None else hash_files(path) for path in weights]
         else:
             del options["detect"]
             others = [_describe_file(path, masks) for path in _mask_files(masks)]
-        edits = None if corrections is None else hash_files(corrections)
+        edits = None if request.corrections is None else hash_files(request.corrections)
         photos = [_describe_file(view.path, view.path.parent) for view in scene.views if view.path.is_file()]
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None

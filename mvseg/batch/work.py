@@ -47,11 +47,10 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     with _one_at_a_time, lock_folder(folder, wait=True):
         earlier = read_status(folder)
         try:
-            config = _with_teacher(config, scene, out)
             request = RunRequest(scene.folder, scene.masks, place, config, corrections=scene.corrections)
-            request = request.with_found(scene.beside)
+            request = _with_teacher(request, scene, out).with_found(scene.beside)
             with collect_warnings():  # the run itself gives them
-                key = scene_key(load_scene(scene.folder), request.masks, config, corrections=request.corrections)
+                key = scene_key(load_scene(scene.folder), request)
             if earlier is not None and earlier.key == key and _is_done(earlier, place):
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
@@ -64,12 +63,14 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     return Finished(status)
 
 
-def _with_teacher(config: RunConfig, scene: BatchScene, out: Path) -> RunConfig:
-    """The same with the weights that have learned the scene's species, if these are better than those before."""
-    learned = None if scene.teacher is None else out / scene.teacher / DETECTOR_FILE
-    if learned is None or not learned.is_file():
-        return config if scene.teacher is None else replace(config, learn="off")
-    return replace(config, detect=replace(config.detect, weights=str(learned)), learn="off")
+def _with_teacher(request: RunRequest, scene: BatchScene, out: Path) -> RunRequest:
+    """The same with the weights that the scene's teacher has learned, if it has learned any. The detector does not
+    learn this plant, too."""
+    if scene.teacher is None:
+        return request
+    taught = out / scene.teacher / DETECTOR_FILE
+    config = replace(request.config, learn="off")
+    return replace(request, config=config, taught=taught if taught.is_file() else None)
 
 
 def _is_done(status: Status, result: Path) -> bool:

@@ -27,7 +27,7 @@ def ids_before(masks: Masks, before: Masks) -> Tensor:
 
 
 def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
-    """Find the leaves that edits are about and leave as they are: none of their masks is gone, changed, kept apart from
+    """Find the leaves that edits mention but do not change: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.
 
     Args:
@@ -55,11 +55,11 @@ def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor
 
 
 def leave_joined(previous: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
-    """The leaves that stay as they were `previous` (D,), without those that other masks join: at least half of the
-    masks of such a leaf are matched to one that the user speaks of, and that is of no such leaf.
+    """`previous` (D,), with -1 for every leaf that other masks join: at least half of the masks of such a leaf are
+    matched to a mask that the user speaks of, and that is of no unchanged leaf.
 
     Args:
-        previous: (D,) int64, their ids; -1 for all other masks.
+        previous: (D,) int64, ids of unchanged leaves; -1 for all other masks.
         matched_ids: (D,) int64, the ids of the masks matched anew.
         is_held: (D,) bool, the masks that the user speaks of.
     """

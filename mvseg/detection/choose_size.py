@@ -21,10 +21,10 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
 
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
-        first: what was found at the usual size.
+        first: the pass at the usual size.
 
     Returns:
-        What was found at the best size, see `order_sizes`.
+        One pass, or two that are nearly as good, see `order_sizes`.
     """
     results, size, num_misses = [first], float(first.passes[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
@@ -44,7 +44,7 @@ def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> li
         most: pixels, the longer side of the photos: no size is larger.
 
     Returns:
-        What was found at the best size, see `order_sizes`.
+        One pass, or two that are nearly as good, see `order_sizes`.
     """
     larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
     sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
@@ -52,7 +52,7 @@ def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> li
 
 
 def order_sizes(results: Sequence[PassResult]) -> list[PassResult]:
-    """Passes by their agreed area: the best one; of equals, the first. And the next best one, if some
-    of the views cannot tell the two apart (`DETECTION.as_good`): then all of them should."""
+    """The pass with the largest agreed area; of equals, the first. Then the second best, if its agreed area is at least
+    `DETECTION.as_good` times the best: the caller decides between the two by all views."""
     ordered = sorted(results, key=lambda each: -each.agreed_area)
     return [each for each in ordered[:2] if each.agreed_area >= DETECTION.as_good * ordered[0].agreed_area]

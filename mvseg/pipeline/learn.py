@@ -25,7 +25,7 @@ from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import plant_of_pass, run_near
+from mvseg.pipeline.find_in_photos import find_in_photos, plant_of_pass, run_near
 from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
@@ -37,8 +37,9 @@ from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
 from mvseg.verification.unexplained import is_familiar
 
 ROUNDS = 2  # limit: where nobody says how many; most plants gain nothing from a third one (docs/detector.md)
-# chosen: growth of the agreed area from which new weights stay. Of rounds that grew by 1.04 to 1.08, four gained 0.03
-# to 0.09 of MV-PQ and one lost 0.02; of five that did not grow, four lost (docs/notes/detector.md).
+# chosen: new weights stay if their rating is at least so many times that of the weights before. Of rounds that grew by
+# 1.04 to 1.08, four gained 0.03 to 0.09 of MV-PQ and one lost 0.02; of five that did not grow, four lost
+# (docs/notes/detector.md).
 GROWTH = 1.03
 
 
@@ -56,8 +57,8 @@ def learn(
         plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of the user, whose masks are certain.
-        rounds: that the user asks for: so many are learned, and the last weights stay, for the user to judge. None: as
-            many as `RunConfig.learn` says, and the agreed area judges.
+        rounds: number of rounds that the user asks for on the page. All are learned, and the last weights stay without
+            comparison, for the user to judge. None: as many as `RunConfig.learn` says, and `Plant.rating` decides.
 
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
@@ -65,7 +66,7 @@ def learn(
     best, areas = plant, [plant.rating]
     try:
         for number in range(1, (_count_rounds(plant) if rounds is None else rounds) + 1):
-            with collect_warnings():  # what there is to say of edits, is said when they are applied
+            with collect_warnings():  # of edits: they are warned of when they are finally applied
                 edited = apply_edits(best, corrections)
             chances = edited.instances.probabilities
             photos = plant.opened.photos
@@ -87,6 +88,28 @@ def learn(
     except InputError as error:
         warn(Finding("learning_failed", values={"reason": str(error)}))
     return replace(best, learned=replace(best.learned, agreed_area=tuple(areas)))
+
+
+def choose_weights(plant: Plant, taught: Path, *, cache: CachedDetections) -> Plant:
+    """Look at a plant with the weights that another one of its species taught, too; the views choose, as after a round.
+
+    Args:
+        plant: of leaves that the views chose, with the weights that the run began with.
+        taught: file of the other weights.
+
+    Returns:
+        The plant as it was, or as the detector sees it with the taught weights, at the size that is best with these.
+    """
+    opened = plant.opened
+    detect = replace(opened.config.detect, weights=str(taught))
+    report_step("looking again, with the weights that another plant of the species taught")
+    with collect_warnings():
+        other = find_in_photos(replace(opened, config=replace(opened.config, detect=detect)), cache=cache)
+    areas = (plant.rating, other.rating)
+    if other.rating < GROWTH * plant.rating:
+        return replace(plant, learned=Learned(agreed_area=areas))
+    weights = _at_size(taught, other.image_size)
+    return replace(other, opened=opened, learned=Learned(weights=weights, agreed_area=areas))
 
 
 def _count_rounds(plant: Plant) -> int:

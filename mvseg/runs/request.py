@@ -28,6 +28,7 @@ class RunRequest:
         force_corrections: apply them even if they were made for other photos.
         overwrite: `out` may hold another scene's result, what another command wrote, or what a run found in its photos.
         learned: weights that have learned this scene before are used, and not learned again.
+        taught: file of weights that another plant of the species taught, see `run_scene`; None: none did.
     """
 
     scene: Path
@@ -38,6 +39,7 @@ class RunRequest:
     force_corrections: bool = False
     overwrite: bool = False
     learned: Learned = NOTHING_LEARNED
+    taught: Path | None = None
 
     @property
     def inputs(self) -> tuple[Path, ...]:

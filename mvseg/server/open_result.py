@@ -184,10 +184,10 @@ class OpenResult:
         return keep_numbers(replace(saved, scene=self.scene, photos=self.photos), self._numbers)
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
-        """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
-        and, as sentences, what was noticed on the way that the run did not tell: that is on the page. Codes are
-        compared, as edits change by how many degrees or masks something is so. Leaves keep their numbers from one
-        result to the next, see `keep_numbers`.
+        """The result with these corrections, without traits and voxels; the problem of each edit, "" for none; and
+        sentences of the findings that the run did not report: those that it did are on the page. Findings are compared
+        by code, as edits change their values. Leaves keep their numbers from one result to the next, see
+        `keep_numbers`.
 
         The result is that of `mvseg infer --again`, bit for bit: what was fitted before is taken where it would be
         fitted to the same.

@@ -65,7 +65,7 @@ class Habit:
 
     @property
     def world_prior(self) -> float:
-        """Log of how much likelier than any other pose it is that the frames agree."""
+        """Log of the probability that the pot was not turned, over that of any single turn."""
         least = ALIGN.least_still
         return math.log(max(self.still, least) / max((1 - self.still) / ALIGN.turns, least))
 

@@ -70,7 +70,7 @@ class LinkNumbers:
     """Links from observation to observation of a leaf."""
 
     most_gap: int = 3  # chosen: max. dates between compared observations: a leaf may be hidden on two
-    unlinked: float = 2.0  # chosen: cost of a pair of leaves up to which one track is cheaper than two
+    unlinked: float = 2.0  # chosen: a pair of leaves that costs less favours one track over two
     user_odds: float = 20.0  # definition: log odds of a user's link for weighing poses: more than any leaf's
     asked: float = 1e4  # limit: gain of a link of the user, above all that leaves can say
     most_odds: float = 40.0  # limit: log odds, at most, so that their exponentials are numbers

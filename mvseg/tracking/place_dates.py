@@ -41,8 +41,8 @@ def place_dates(num_dates: int, poses_of_pairs: PosesOfPairs, habit: Habit) -> t
 
     Returns:
         (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)
-        the index of that date; and (T - 1,) how likely the plant was not turned otherwise between each date and the
-        next, see `weigh_turns`.
+        the index of that date; and (T - 1,) the probability that the turn from each date to the next is right, see
+        `weigh_turns`.
     """
     if habit.still == 1:  # somebody says so
         return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)

@@ -101,7 +101,7 @@ def are_labels(masks: Masks, probabilities: Mapping[int, float]) -> Tensor:
 
     A mask is a label when it likely shows its instance (match score of at least `SURE`), this is likely a leaf (P of at
     least `LIKELY`; an instance without a P is one), and a detector or a user found it there; or when the user made or
-    confirmed it. Not learned from are masks that only the other views show, or that one or two views show.
+    confirmed it. Masks that surfaces of other views made (`Origin.OTHER_VIEWS`) are none.
 
     Returns:
         (D,) bool.

@@ -64,10 +64,13 @@ class LeafTraits:
 
     @property
     def use(self) -> Use:
-        """Whether to use its numbers: "yes", "look" at it first, or "no", where there are none of a leaf."""
-        if self.rejection is not None or self.method == "none" or USELESS & self.reasons.keys():
+        """Whether to use its numbers: "yes", "look" at it first, or "no" if it is rejected, has no shape, or its
+        surface fits badly. Of voxels, which replace the worst surfaces, "look"."""
+        if self.rejection is not None or self.method == "none":
             return "no"
-        return "yes" if self.method == "surface" and self.reasons.keys() <= HARMLESS else "look"
+        if self.method != "surface":
+            return "look"
+        return "no" if USELESS & self.reasons.keys() else "yes" if self.reasons.keys() <= HARMLESS else "look"
 
     def __repr__(self) -> str:
         area, length = self.numbers["area"], self.numbers["length"]

@@ -2,9 +2,10 @@
 
 Rays and epipolar lines know nothing of shape. A surface that is fitted to an instance's masks in all views says what
 each view must show of it. So the instances of given masks are candidates, and those that the matcher finds once more
-(`match_again.py`), and `choose` asks which masks show them. Given masks are proposals that surely show some leaf: so
-each keeps its id unless it more likely than not shows another leaf that has no other mask in its view. Where two
-surfaces explain one mask in disjoint parts, it shows two leaves (`find_shared`). Not in the paper.
+(`match_again.py`), and `choose` asks which masks show them. Given masks count as proposals with a detection score of
+`CHOICE.given`. A mask keeps its id unless another leaf takes it with a q of `SURE` or more, and no mask of its view
+stays with that leaf. Where two surfaces explain one mask in disjoint parts, it shows two leaves (`find_shared`). Not in
+the paper.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def check_ids(
     show two surfaces are marked as merged (`find_shared`).
 
     Args:
-        masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
+        masks: D masks. A merged mask that moves loses that mark, unless two surfaces are found in it again. Masks that
             the user corrected or linked keep their ids.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         config: that the masks were matched with.

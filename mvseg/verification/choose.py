@@ -78,8 +78,8 @@ def choose_leaves(
 
     Masks that the user corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
     that no detector found. What else lies there goes, and what the user took away does not come back. All other
-    candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. Where
-    all that edits say of a leaf holds already, its candidate is one of these.
+    candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. A leaf
+    that satisfies all edits about it already keeps its candidate from before the edits.
 
     Args:
         matched: D masks, matched; `labels` of detected ones are rows of `proposals`.
@@ -87,9 +87,8 @@ def choose_leaves(
         more: masks of other matchings, of more of the proposals, with such labels, too.
         removed: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the
             user's masks are candidates here, and `more` has the others.
-        previous: (D,) int64, the leaf that each mask was chosen for before edits, if that is left as it was; -1
-        elsewhere.
-            None: for none.
+        previous: (D,) int64, the leaf of each mask before the edits, if they leave that leaf unchanged; otherwise -1.
+            None: -1 everywhere.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 

@@ -57,7 +57,8 @@ class Candidates:
         surfaces: K, None where the masks of one agree on none.
         matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
         certain: (D, K) bool: the user says that the mask shows the candidate.
-        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 without a surface.
+        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 where no tube was tried (no surface, or not
+            slender).
     """
 
     surfaces: tuple[LeafSurface | None, ...]

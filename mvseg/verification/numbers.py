@@ -14,7 +14,7 @@ class EvidenceNumbers:
     """Evidence of surfaces for masks."""
 
     most_px: int = 800  # limit: longer side of the photos on which masks are compared, at most
-    fits: float = 0.5  # definition: IoU with what a view shows of a leaf from which a mask shows the leaf
+    fits: float = 0.5  # definition: a mask shows a leaf if its IoU with the visible part of the leaf is larger
     open_pixels: int = 100  # chosen: unhidden pixels of a surface that a view sees openly, at least
     shared: float = 0.5  # definition: fraction of the smaller of two masks that is in both, where they show one leaf
 
@@ -45,7 +45,7 @@ class AgainNumbers:
 
 @dataclass(frozen=True)
 class ChoiceNumbers:
-    """The choice of leaves and masks among what a detector found."""
+    """The choice of leaves and masks among proposals, and among given masks."""
 
     rounds: int = 2  # limit: in the first nothing hides anything, in the second the leaves of the first do
     same: float = 0.8  # chosen: Jaccard index of the masks of two candidates, by area, above which they are one

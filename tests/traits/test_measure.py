@@ -115,6 +115,23 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     assert traits.whole["total_leaf_area"].method == "surface (2 of 4 leaves)"
 
 
+@pytest.mark.parametrize(
+    ("method", "codes", "use"),
+    [
+        ("surface", [], "yes"),
+        ("surface", ["shows_more"], "yes"),
+        ("surface", ["shows_more", "two_views"], "look"),
+        ("surface", ["poor_fit"], "no"),
+        ("voxels", ["no_blade", "poor_fit"], "look"),  # voxels do not depend on the surface
+        ("none", ["one_view"], "no"),
+    ],
+)
+def test_numbers_are_used_by_their_method_and_reasons(method: str, codes: list[str], use: str) -> None:
+    traits = LeafTraits(1, {}, method, dict.fromkeys(codes, "why"), None)
+    assert traits.use == use
+    assert replace(traits, rejection="stem").use == "no"
+
+
 def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     matching, surfaces = make_inputs([1, 2, 3, 4])
     is_doubtful = (matching.instance_ids == 2) & (matching.masks.view_index > 0)
