@@ -66,10 +66,10 @@ class Corrected:
 
     Attributes:
         masks: D masks on the CPU, by view, matched to nothing.
-        links: of their rows; those that no edit names keep outlines apart from what else their photos show.
+        links: of their rows. Besides those of edits, links keep outlines apart from the other masks of their photos.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: the edits about whole instances.
-        refused: the pixels where the user says that no leaf is, and where no mask is.
+        refused: pixels that the user rejects and that lie in no mask.
         fates: of the edits, in their order.
     """
 

@@ -111,12 +111,12 @@ class _File(BaseModel):
 
 @dataclass(frozen=True)
 class Corrections:
-    """Edits, which hold in their order: a later one wins.
+    """Edits in their order: a later one wins.
 
     Attributes:
         edits: in the order of the file.
         source: the file that they were read from, for messages; None in memory.
-        photos: {view: mark} of the photos that they were made for; empty where nobody says so.
+        photos: {view: mark} of the photos that they were made for; empty if unknown.
     """
 
     edits: tuple[Edit, ...] = ()

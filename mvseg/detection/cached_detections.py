@@ -58,7 +58,7 @@ class CachedDetections:
         return self._use(f"learned-{hashlib.sha256(made_from.encode()).hexdigest()}.safetensors")
 
     def delete_others(self) -> None:
-        """Delete what this run did not ask for, and the folder if nothing else is in it."""
+        """Delete the cached files that this run did not use, and the folder if it is empty then."""
         delete_cached(self.folder, but=self.used)
 
     def _use(self, name: str) -> Path:
@@ -67,7 +67,7 @@ class CachedDetections:
 
 
 def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
-    """Cache what a detector found in one photo: float and int64 tensors on the CPU, see `run_heads`."""
+    """Cache the detections of one photo: float and int64 tensors on the CPU, see `run_heads`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = safetensors.torch.save({key: value.contiguous() for key, value in detections.items()})
     write_whole(path, lambda partial: partial.write_bytes(content))
@@ -84,7 +84,7 @@ def read_detections(path: Path) -> dict[str, Tensor] | None:
 
 
 def delete_cached(folder: Path, *, but: Collection[str] = ()) -> None:
-    """Delete what is cached but the files of the given names, and the folder if nothing else is in it."""
+    """Delete all cached files except those of the given names, and the folder if it is empty then."""
     if not folder.is_dir():
         return
     for path in [*folder.iterdir()]:

@@ -113,8 +113,8 @@ def load_detector(weights: str | Path, *, image_size: int | None = None, min_sco
     Args:
         weights: the name of a shipped detector (`list_detectors`), a .safetensors file that a training run wrote, or a
             result folder whose plant a detector has learned.
-        image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to what the
-            file says, smaller ones stay as they are.
+        image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to the
+            size that the file states, smaller ones are not scaled.
         min_score: detections that score less are discarded; `mvseg infer` does so at 0.3. None for torchvision's 0.05.
 
     Raises:

@@ -279,8 +279,8 @@ def turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 
 
 def read_exposure(path: Path) -> float:
-    """How bright a JPEG shows what stands in the same light, in stops, by EXIF: log2(seconds x ISO / f-number^2); NaN
-    where it does not say all three."""
+    """Exposure of a JPEG by EXIF, in stops: log2(seconds x ISO / f-number^2); the same object in the same light is
+    brighter where it is larger. NaN if EXIF lacks one of the three."""
     try:
         with _any_fault(), path.open("rb") as file:
             said = JpegImageFile(file).getexif().get_ifd(EXPOSURE_BLOCK)

@@ -16,7 +16,7 @@ def split_merged(masks: Masks) -> Masks:
     """Cut each mask that shows two instances in two, one part per instance.
 
     Args:
-        masks: D masks, of which `second_parts` tells what shows a second instance.
+        masks: D masks; `second_parts` are the pixels that show a second instance.
 
     Returns:
         D' >= D masks on the same device and in the same order, the second part of a mask right after the first. Both

@@ -119,8 +119,8 @@ class ViewGraph:
         return Movers(rows, np.argsort(np.argsort(first))[owner])
 
     def forbidden(self, movers: Movers, clusters: Ints, numbers: Ints) -> Bools:
-        """(N, K) bool: the clusters `numbers` (K,) that each mover cannot join: the others hold a region that it is
-        apart from, or, but for the cluster (D,) that it is in, one in its view."""
+        """(N, K) bool: the clusters `numbers` (K,) that each mover cannot join. These hold a region that links keep
+        apart from it, or a region of its view, unless it is in that cluster already."""
         is_forbidden = np.zeros((movers.num, len(numbers)), bool)
         if not len(self.links):
             return is_forbidden
@@ -164,7 +164,7 @@ class Movers:
 
 
 def first_without_links(graph: ViewGraph, cluster: Callable[[ViewGraph, Clusters | None], Clusters]) -> Clusters:
-    """Partition of a method without links where it agrees with all of them: it is the best partition under them, too.
-    Otherwise what it finds with them; then it is told what it found without."""
+    """Partition by a method. Without links, if the partition agrees with all of them: it is the best one under them,
+    too. Otherwise with links; the method then gets the partition without them as its second argument."""
     found = cluster(graph.without_links, None)
     return found if graph.links.agree(found) else cluster(graph, found)

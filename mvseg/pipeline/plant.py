@@ -96,8 +96,8 @@ class Plant:
 
     @cached_property
     def editable(self) -> Masks:
-        """The masks that the user sees, and edits: those that were given, or those that the views chose, and what else
-        was surely detected beside these."""
+        """Masks that the user sees and edits: given masks, or accepted ones and, beside them, sure detections that show
+        something else."""
         if self.opened.is_chosen:
             return add_beside(self.masks, self.matched[0], self.scene.cameras)
         return self.masks if self.opened.given is None else self.proposals
@@ -108,7 +108,7 @@ class Plant:
         return draw_views(self.proposals.regions, (), self.scene.cameras.to("cpu"))
 
     def draw_ahead(self) -> None:
-        """Find what all edits of chosen masks begin with, before anybody waits for the first one."""
+        """Compute in advance what all edits of detected masks begin with."""
         _ = self.editable, [each.is_shared for each in self.drawn]
 
     @cached_property

@@ -73,8 +73,8 @@ def calibrated_size(calibration: Calibration, photos: Sequence[PhotoFile]) -> tu
 
 
 def list_photos(folder: Path) -> tuple[Path, list[str]]:
-    """The photos of a folder: those in it; or else those in its `images/`; or else those in all its folders, each of
-    which stands for a camera.
+    """List the photos of a folder: the files in it; without any, those in its `images/`; without these, those in its
+    sub-folders, one for each camera.
 
     Returns:
         The folder (or its `images/`), and the paths of the photos relative to it, in natural order.

@@ -32,7 +32,7 @@ def spread_views(cameras: Cameras, most: int) -> Tensor:
 
 
 def spread_directions(ways: NDArray[np.float64], most: int) -> NDArray[np.int64]:
-    """The same of directions (V, 3) from what is looked at to the cameras, unit vectors."""
+    """The same for unit directions (V, 3) from the object to the cameras."""
     if len(ways) <= most:
         return np.arange(len(ways))
     crowding = 1 / (((ways[:, None] - ways[None]) ** 2).sum(2) + RAYS.same**2)

@@ -25,7 +25,7 @@ class ScaleBar:
 
     Attributes:
         share: its length, as a share of the photo's width, in (0, 0.2].
-        text: the length that it stands for, with its unit.
+        text: the length in the world, with its unit.
     """
 
     share: float

@@ -26,8 +26,8 @@ class RunRequest:
         config: the options of all stages.
         corrections: file of the user's edits; None without any.
         force_corrections: apply them even if they were made for other photos.
-        overwrite: `out` may hold another scene's result, what another command wrote, or what a run found in its photos.
-        learned: weights that have learned this scene before are used, and not learned again.
+        overwrite: replace another scene's result, output of another command, or detected masks in `out`.
+        learned: weights that have learned this scene before; they are used, and nothing is learned again.
         taught: file of weights that another plant of the species taught, see `run_scene`; None: none did.
     """
 

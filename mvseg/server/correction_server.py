@@ -26,7 +26,7 @@ LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # chosen: that learning takes on
 
 
 def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:
-    """Run `mvseg` in a process of its own: its exit code, and the last line that it told."""
+    """Run `mvseg` in a process of its own: its exit code, and the last line on its stderr."""
     command, last_line = [sys.executable, "-m", "mvseg.cli", *words], ""
     with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         for line in process.stderr or ():
@@ -106,7 +106,7 @@ class Idle:
 
 @dataclass(frozen=True)
 class Computing:
-    """The consequences of the newest edits are computed; `doing` says what, "" for what is done at once."""
+    """The consequences of the newest edits are computed; `doing` names a long step, "" for a short one."""
 
     number: int
     doing: str = ""

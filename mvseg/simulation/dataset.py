@@ -158,8 +158,8 @@ def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_w
 
 
 def claim_dataset(folder: Path, *, recipe: str) -> None:
-    """Make an empty folder that of a data set, or go on with the one that it holds, minus what a killed run left
-    unfinished."""
+    """Claim an empty folder for a data set, or one that holds the same data set; unfinished files of a killed run are
+    deleted."""
     made_from = folder / "dataset.json"
     if not made_from.is_file() and not all(is_partial(path) for path in folder.iterdir()):
         raise InputError(f"{folder}: holds files that are not a data set, expected a new or empty folder")

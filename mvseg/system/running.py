@@ -57,7 +57,7 @@ _NOW: ContextVar[Running] = ContextVar("mvseg_running")
 
 
 def now_running() -> Running:
-    """How the run that this is called in works; without `running`, silently and in this process."""
+    """State of the run that this is called in; without `running`, a silent one in this process."""
     return _NOW.get(SILENT)
 
 
@@ -128,8 +128,8 @@ def timed(stage: str) -> Iterator[None]:
 
 
 def report_step(sentence: str) -> None:
-    """Tell whoever asked for reports what is done now, or print it beside the progress bars; nothing where the run is
-    silent."""
+    """Report the present step to the callback of the run, or print it beside the progress bars; nothing in a silent
+    run."""
     if (report := now_running().report) is not None:
         report(sentence)
     elif now_running().progress:
@@ -137,7 +137,7 @@ def report_step(sentence: str) -> None:
 
 
 def expected_minutes(stage: str) -> str:
-    """How long a stage will take, in words, if it is to detection as it was measured to be."""
+    """Expected time of a stage, in words: the measured ratio to detection, times the time of detection."""
     seconds = now_running().seconds.get("detect", 0.0) * EXPECTED[stage] / EXPECTED["detect"]
     return f"some {max(1, round(seconds / 60))} minutes"
 

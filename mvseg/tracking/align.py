@@ -47,7 +47,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Habit:
-    """How often a pot stands as it stood: what somebody says, or what a plant's dates tell.
+    """How often a pot stands as on the date before: stated by the user, or estimated from the dates of a plant.
 
     Attributes:
         still: probability, before anything is known of a pair of dates.

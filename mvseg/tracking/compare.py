@@ -40,8 +40,8 @@ class Comparison:
             others.
         roots: (T,) index of that date.
         trust: (T, T) probability that two dates stand to each other as `poses` says.
-        otherwise: {(earlier, later): (N, M) probability that their leaves are the same, over the other poses that were
-            looked at}, each as likely as it is among them; 0 where there are none.
+        otherwise: {(earlier, later): (N, M) probability that their leaves are the same if another pose is right}: the
+            mean over the other poses, weighted by their probabilities; 0 without any.
         motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
 

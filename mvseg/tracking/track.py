@@ -57,8 +57,8 @@ class Tracks:
         plant: its name.
         dates: in the order of time, all in the unit of the first.
         rows: by date, then by track.
-        poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the earliest date that it is
-            aligned with, by way of others.
+        poses: (T, 4, 4) first_from_date, from the frame of a date to that of the earliest date that it is aligned with,
+            directly or by way of other dates.
         roots: (T,) index of that earliest date.
         findings: dates whose alignment is a guess, leaves that moved by themselves, leaves without a shape.
         chances: see `pairwise_chances`; rows and columns are those of `PlantOnDate.shaped`.

@@ -208,8 +208,8 @@ def measure_plant(
 
 
 def tilt(numbers: Mapping[str, Measurement], degrees: float, *, extent: float) -> dict[str, Measurement]:
-    """The numbers, those that need up with what the stem tells of it: it leans by so many degrees (standard deviation),
-    and heights by that over half of the `extent` of the plant; unchanged for 0."""
+    """The numbers, with larger deviations for those that need up, where up is that of the stem. The stem leans by so
+    many degrees (standard deviation); heights err by that over half of the `extent` of the plant. Unchanged for 0."""
     tilted = dict(numbers)
     for name, number in numbers.items():
         if degrees and number.exists and name in (*NEED_UP, "height"):

@@ -156,7 +156,7 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
 
 
 def thin_tube(places: Sequence[tuple[float, float, float]]) -> Tube:
-    """A tube of no radius from place to place, of which nothing else is known."""
+    """A tube without a radius through these places."""
     points = np.array(places, dtype=float).reshape(-1, 3)
     return as_tube(points if len(points) > 1 else np.repeat(points, 2, 0), np.zeros(3))
 

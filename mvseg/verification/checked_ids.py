@@ -140,9 +140,9 @@ def find_shared(
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 
-    Half of the image of the second one must lie in the mask, or the matcher must have named the two: a
-    mask that is drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The
-    second part is what is nearer to what is seen of the second surface than to what is seen of the first.
+    Half of the image of the second one must lie in the mask, or the matcher must have named the two: a mask that is
+    drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The second part are
+    the pixels that are nearer to the visible part of the second surface than to that of the first.
 
     Args:
         masks: D masks with the ids of the matcher.

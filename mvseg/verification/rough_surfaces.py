@@ -14,8 +14,7 @@ from mvseg.verification.numbers import ROUGH
 
 
 def fit_roughly(masks: Masks, cameras: Cameras, cache: SurfaceCache | None = None) -> dict[int, LeafSurface]:
-    """{instance id: surface} to verify masks with. It does not warn: what still holds after the correction is said
-    then."""
+    """{instance id: surface} to verify masks with. Nothing is warned of: the final fits warn."""
     with collect_warnings():
         return fit_surfaces(
             masks.regions, masks.instance_ids, cameras, most_views=ROUGH.views, is_rough=True, cache=cache

@@ -111,9 +111,10 @@ def features(evidence: IdEvidence) -> Floats:
 
 
 def scene_features(evidence: IdEvidence) -> Floats:
-    """(D, 5): 1, what the region says, what the scene says, their product, and how far the second opinion agrees.
+    """(D, 5): 1, log odds of the region, log odds of the scene, their product, and the agreement with the clusters of
+    weights alone.
 
-    Region and scene say log-odds, of the first regression for the region and of its mean over the matched regions.
+    Log odds are those of the first regression, for the region and for its mean over the matched regions.
     """
     sure = 1 / (1 + np.exp(-(features(evidence) @ list(REGION.values()))))
     is_matched = evidence.num_partners > 0

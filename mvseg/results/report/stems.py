@@ -35,7 +35,7 @@ def draw_lines(result: Result, view: int, picture: Picture) -> list[dict[str, An
 
 
 def describe_stems(result: Result) -> list[dict[str, Any]]:
-    """One entry per stem: what showed it, the phyllotaxis that it suggests, and its nodes, upwards."""
+    """One entry per stem: its source, the phyllotaxis that it suggests, and its nodes, upwards."""
     stems = []
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
