@@ -90,7 +90,7 @@ def run_batch(
 
 
 def _find_weights(config: RunConfig) -> RunConfig:
-    """The same options with the absolute path of weights that do not ship: workers may run elsewhere.
+    """Make the path of weights that do not ship absolute: workers may run elsewhere.
 
     Raises:
         InputError: there are no such weights.
@@ -122,8 +122,8 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
-    """Run all scenes in parallel, first those that teach the detector; then those whose worker died once more, one at a
-    time, when memory is free again. Where a teacher fails, the next scene of its species teaches."""
+    """Run all scenes in parallel, teachers first. Scenes whose worker died run once more, one at a time, when memory is
+    free again. Where a teacher fails, the next scene of its species teaches."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
     running: dict[int, str] = {}  # in the order in which they began
@@ -172,7 +172,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
 
 
 def _replace_teachers(waiting: Mapping[int, BatchScene]) -> dict[int, BatchScene]:
-    """The same scenes, whose teachers have failed; the first scene of each now teaches the others."""
+    """The same scenes after their teachers have failed: the first one of each failed teacher now teaches the others."""
     first: dict[str | None, str] = {}
     for scene in waiting.values():
         if first.setdefault(scene.teacher, scene.name) == scene.name:

@@ -114,7 +114,7 @@ def track_plants(
 
 @contextmanager
 def _open(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """As `open_workers`, but one worker is this process."""
+    """Open workers as `open_workers` does; a single one is this process."""
     if scheduler is None and num_workers == 1:
         yield lambda items, _: ((index, work(item)) for index, item in items.items())
     else:

@@ -64,8 +64,8 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
 
 
 def _with_teacher(request: RunRequest, scene: BatchScene, out: Path) -> RunRequest:
-    """The same with the weights that the scene's teacher has learned, if it has learned any. The detector does not
-    learn this plant, too."""
+    """The same request with the weights that the scene's teacher has learned, if it has learned any. The detector does
+    not learn this plant, too."""
     if scene.teacher is None:
         return request
     taught = out / scene.teacher / DETECTOR_FILE

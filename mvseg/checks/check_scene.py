@@ -107,8 +107,8 @@ def check_scene(
 
 
 def _judge(findings: Sequence[Finding], groups: NDArray[np.int64], *, is_detected: bool) -> list[Finding]:
-    """What masks say of poses, but for views whose photos fit the cameras of most others (`groups_that_fit`): there the
-    poses are right, so the masks are of another photo, or are the detector's mistakes."""
+    """Findings about poses from masks. Views whose photos fit the cameras of most others (`groups_that_fit`) are
+    excepted: their poses are right, so their masks are of another photo, or mistakes of the detector."""
     sizes = np.bincount(groups)
     is_sound = (groups == sizes.argmax()) & (sizes.max() > len(groups) / 2)
     judged = []

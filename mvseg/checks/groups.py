@@ -64,8 +64,8 @@ def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.
 
 
 def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The members so that those that agree stand together: by the second eigenvector of the graph's Laplacian (the
-    Fiedler vector of the normalized cut, Shi and Malik 2000)."""
+    """Order the members so that those that agree are neighbours: by the second eigenvector of the graph's Laplacian
+    (the Fiedler vector of the normalized cut, Shi and Malik 2000)."""
     weight = np.nan_to_num(pairs.fitting[np.ix_(members, members)]).clip(AGREEMENT.chance / 10)
     np.fill_diagonal(weight, 0)
     root = np.sqrt(weight.sum(1))

@@ -66,7 +66,7 @@ class ViewAgreement:
 
 @dataclass(frozen=True, eq=False)
 class _Spans:
-    """Where N masks begin and end in a pencil: (N, 2) radians, and (N, 2) radians per pixel there."""
+    """Ends of N masks in a pencil: (N, 2) radians, and (N, 2) radians per pixel there."""
 
     ends: Tensor
     pitch: Tensor
@@ -154,7 +154,7 @@ def is_sure(pairs: PoseAgreement) -> bool:
 
 
 def _against(pairs: PoseAgreement, agreeing: list[int]) -> tuple[Floats, Floats]:
-    """(V,) fitting share and median offset of every view against those that are kept; nan without any."""
+    """(V,) fitting share and median offset of every view against the remaining ones; NaN without any."""
     fitting, offset = np.full((2, len(pairs.fitting)), np.nan)
     for view in range(len(fitting)):
         others = [other for other in agreeing if other != view and pairs.num_masks[view, other]]

@@ -84,7 +84,7 @@ def _read_again(args: Namespace) -> RecordedTracks:
 
 
 def _read_results(args: Namespace) -> RecordedTracks:
-    """What the results on the command line are to be."""
+    """Read the results that the command line names."""
     from mvseg.batch.track_plants import list_plants
     from mvseg.tracking.recorded import PlantResults, RecordedTracks
 
@@ -107,7 +107,7 @@ def _read_results(args: Namespace) -> RecordedTracks:
 
 
 def _name_plant(results: Sequence[Path]) -> str:
-    """What the names of all results begin with, without a date; nothing where that is short."""
+    """Common beginning of the names of all results, without a date; "" where it is short."""
     names = (path.resolve().name for path in results)
     shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
     name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")

@@ -32,7 +32,7 @@ from mvseg.scene import Scene
 
 
 class _Tie(NamedTuple):
-    """What an edit says of two masks, by their keys: that they must, or cannot, show one leaf."""
+    """Statement of an edit about two masks, by their keys: they must, or cannot, show one leaf."""
 
     edit: int
     must: bool
@@ -275,7 +275,7 @@ def _ties_of_words(words: Sequence[tuple[str, int, Key]], place: Mapping[Key, in
 def _tell_of_parts(
     edited: _Edited, masks: Sequence[EditedMask], component: NDArray[np.int64], scene: Scene
 ) -> _Edited:
-    """Masks of one photo that edits say are one leaf, but do not touch: the last of these edits says so."""
+    """Find masks of one photo that edits make one leaf, but that do not touch; the last of these edits reports it."""
     group_of = {mask.key: int(group) for mask, group in zip(masks, component, strict=True)}
     groups: dict[tuple[int, int], list[EditedMask]] = {}
     for mask in masks:
@@ -322,7 +322,7 @@ def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited,
 
 
 def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
-    """An outline is a leaf: other masks of its photo show other ones, but for those that links join to it."""
+    """Keep each outline apart from the other masks of its photo, unless a link joins them: an outline is a leaf."""
     component, views = links.components(len(masks)), np.array([mask.view for mask in masks], np.int64)
     is_drawn = np.array([mask.origin == Origin.CORRECTED for mask in masks], bool)
     apart = is_drawn[:, None] & (views[:, None] == views) & (component[:, None] != component)
@@ -340,8 +340,8 @@ def _mask_at(edited: _Edited, place: Place, scene: Scene) -> EditedMask:
 
 
 def _remaining_mask_at(edited: _Edited, number: int, place: Place, scene: Scene) -> tuple[_Edited, EditedMask]:
-    """The same for an edit that says something of a leaf: a mask that was rejected there comes back, if there is no
-    other, and its rejection is contradicted. The later edit wins."""
+    """The mask at a place, for an edit about a leaf. If all masks there were rejected, the last of them comes back, and
+    its rejection is contradicted: the later edit wins."""
     gone = _masks_at(place, [mask for _, mask in edited.rejected], scene)
     if gone and not _masks_at(place, edited.masks, scene):
         edited = replace(edited, masks=(*edited.masks, gone[-1]))
@@ -355,7 +355,7 @@ def _remaining_mask_at(edited: _Edited, number: int, place: Place, scene: Scene)
 
 
 def _masks_at(place: Place, masks: Sequence[EditedMask], scene: Scene) -> list[EditedMask]:
-    """Those of these masks that a place lies in."""
+    """Masks among these that contain a place."""
     view, column, row = _pixel_at(scene, place)
     return [mask for mask in masks if mask.view == view and mask.crop.holds(column, row)]
 

@@ -32,7 +32,7 @@ DatedPlace = tuple[Text, Text, Pixel, Pixel]  # scene, view, x, y
 
 
 class _Edit(BaseModel):
-    """Who made an edit, and when: kept as they are."""
+    """Author and time of an edit, which are kept unchanged."""
 
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
     by: Text | None = None

@@ -79,7 +79,7 @@ def _op(link: LeafLink) -> str:
 
 
 def _is_contradiction(links: Sequence[LeafLink]) -> bool:
-    """Whether two leaves of a date would be one, or two that are said to be different."""
+    """Whether links would join two leaves of a date, or two that another link keeps apart."""
     part_of: dict[tuple[str, int], set[tuple[str, int]]] = {}
     for link in links:
         if link.is_same:

@@ -83,7 +83,7 @@ def _detect(
     cache: CachedDetections | None,
     made_by: str,
 ) -> list[dict[str, Tensor]]:
-    """What the detector finds in every photo, or in its box (V, 4) xyxy."""
+    """Detections in every photo, or in its box (V, 4) xyxy."""
     every, scene = [], photos.scene
     device = next(model.parameters()).device
     with timed("detect"):

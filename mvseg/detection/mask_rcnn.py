@@ -187,7 +187,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         min_score: float = 0.0,
         residual_px: int | None = None,
     ) -> Matching:
-        """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
+        """Match the remaining proposals whose mask is not empty; `labels` are their rows."""
         with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
             proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
             is_asked = (proposals.regions.areas > 0) & (proposals.detection_scores >= min_score)
@@ -225,7 +225,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
 
 def _disagreement_of(matching: Matching) -> Matching:
-    """The same; warns (InputWarning) where the views disagree, see `find_disagreement`."""
+    """Return the matching; warn (InputWarning) if the views disagree, see `find_disagreement`."""
     if (disagreement := find_disagreement(matching, is_detected=True)) is not None:
         warn(disagreement)
     return matching

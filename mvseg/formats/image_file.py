@@ -243,7 +243,7 @@ def is_turned(path: Path) -> bool:
 
 
 def _orientation_of(image: ImageFile) -> int:
-    """Of an image that has been opened, not decoded."""
+    """EXIF orientation of an image that is open, not decoded."""
     if isinstance(image, TiffImageFile):
         tag = image.tag_v2.get(ORIENTATION)
     elif isinstance(image, PngImageFile):  # whose own method decodes it, to find a chunk behind the pixels

@@ -95,7 +95,7 @@ def is_scene_folder(folder: Path) -> bool:
 
 
 def _describe(folder: Path) -> str:
-    """What a folder without cameras holds, and what to do with it, as the end of a sentence."""
+    """Content of a folder without cameras, and advice, as the end of a sentence."""
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*"))]
     photos = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
     if photos:

@@ -213,7 +213,7 @@ def _pair_pitches(
 
 
 def _thin(samples: Samples) -> Tensor:
-    """Of many pixels, about `EPIPOLAR.pitch_pixels` on a square lattice: enough for a mean, whatever their order."""
+    """Select about `EPIPOLAR.pitch_pixels` of many pixels, on a square lattice: enough for a mean, in any order."""
     step = int((samples.num_pixels / EPIPOLAR.pitch_pixels) ** 0.5)
     if step < 2:
         return samples.pixels().xy

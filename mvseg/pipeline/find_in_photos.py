@@ -70,7 +70,8 @@ def _run_in_all(
 
 
 def _choose_pass(opened: Opened, results: Sequence[PassResult], detect: DetectConfig) -> PassResult:
-    """Of one or two passes, the better one first, that one, or both as one set: where the agreed area is largest."""
+    """Select from one or two passes, the better one first: the best one, or both as one set, by the largest agreed
+    area."""
     best, *others = results
     for other in others:
         with collect_warnings():  # those of the passes say it
@@ -120,7 +121,7 @@ def run_pass(
     """
     with collect_warnings() as findings:
         detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        cameras, splits = opened.scene.cameras, opened.is_cut
+        cameras, splits = opened.scene.cameras, opened.config.split_merged and not opened.is_checked
         result = find_leaves(detected, cameras, config=detect, splits=splits, cache=opened.surfaces)
     return replace(result, findings=tuple(findings))
 

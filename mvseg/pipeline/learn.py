@@ -113,8 +113,8 @@ def choose_weights(plant: Plant, taught: Path, *, cache: CachedDetections) -> Pl
 
 
 def _count_rounds(plant: Plant) -> int:
-    """How many rounds to try; with "auto", none where the detector knows the species: the views agree about its leaves,
-    it is sure of most of them, and sees them best at its own size."""
+    """Number of rounds to try. With "auto", none where the detector knows the species: the views agree about its
+    leaves, most of these score well, and its own size is the best one."""
     opened = plant.opened
     if not opened.is_chosen or opened.config.learn == "off":
         return 0

@@ -76,11 +76,6 @@ class Opened:
         return shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not self.is_chosen
 
     @property
-    def is_cut(self) -> bool:
-        """Whether masks that show two leaves are cut before surfaces are fitted."""
-        return self.config.split_merged and not self.is_checked
-
-    @property
     def is_chosen(self) -> bool:
         """Whether the views choose the masks, of all that a detector proposes."""
         return self.given is None and self.config.detect.verify

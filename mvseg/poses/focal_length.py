@@ -96,7 +96,7 @@ def zoom_finding(lengths: NDArray[np.float64], shared: float) -> Finding:
 
 
 def _with_own_lenses(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The same photos and points, each photo with a camera of its own, which has its number."""
+    """The same photos and points, where each photo has a camera of its own with the number of the photo."""
     own = pycolmap.Reconstruction()
     for number in model.reg_image_ids():
         image, camera = model.images[number], model.cameras[model.images[number].camera_id]

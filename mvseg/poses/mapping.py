@@ -108,7 +108,7 @@ def find_structure(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """What all attempts share: `work` holds databases, and below PHOTOS the photos under the names of `photo_of`."""
+    """Data of all attempts: `work` holds databases, and below PHOTOS the photos under the names of `photo_of`."""
 
     work: Path
     photo_of: Mapping[str, PhotoFile]
@@ -149,7 +149,7 @@ def _map_thoroughly(task: _Task, pairs: Sequence[Pair]) -> list[pycolmap.Reconst
 
 
 def _sorted(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """The largest first; of equal ones those that were found first."""
+    """Sort by size, the largest first; equal ones stay in their order."""
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 

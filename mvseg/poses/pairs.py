@@ -54,7 +54,7 @@ def pairs_with(some: Iterable[int], num_photos: int) -> list[Pair]:
 
 
 def _steps(num_photos: int) -> list[int]:
-    """How far off the neighbours of a photo are, in a sequence."""
+    """Distances to the neighbours of a photo in a sequence."""
     steps = list(range(STRUCTURE.overlap + 1))
     while steps[-1] * STRUCTURE.far <= num_photos // 2:
         steps.append(steps[-1] * STRUCTURE.far)

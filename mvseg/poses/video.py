@@ -148,7 +148,7 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
 
 
 def _flow(before: Grey, after: Grey, corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where corners (C, 1, 2) are in the other picture, and (C,) whether they were found."""
+    """Positions of corners (C, 1, 2) in the other picture, and (C,) whether they were found."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(VIDEO.window, VIDEO.window), maxLevel=VIDEO.levels
     )
@@ -183,7 +183,7 @@ def _opened(clip: Path) -> Iterator[cv2.VideoCapture]:
 def _read(
     video: cv2.VideoCapture, numbers: list[int] | None = None, *, every: int = 1
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Numbers and frames (H, W, 3) BGR, of these numbers or of every so many."""
+    """Read numbers and frames (H, W, 3) BGR: the frames of given numbers, or one of every so many."""
     wanted = None if numbers is None else set(numbers)
     number = 0
     while video.grab():  # seeking would be quicker, and lands elsewhere in many files

@@ -64,7 +64,7 @@ def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
 
 
 def _exchange(crowding: NDArray[np.float64], is_taken: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The same number of views, better spread: the exchange of two views that helps most, until none helps."""
+    """Spread the views better: make the exchange of two views that helps most, until none helps."""
     is_taken = is_taken.copy()
     while True:
         load = crowding @ is_taken

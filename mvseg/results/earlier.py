@@ -68,7 +68,7 @@ class _Made(BaseModel):
 
 
 class _Run(BaseModel):
-    """What a run file says, see `Output.describe`; that of an earlier version may say of its files only."""
+    """Content of a run file, see `Output.describe`; a file of an earlier version may only list its files."""
 
     output: _Made | None = None
     files: dict[_Name, str] | None = None

@@ -195,7 +195,7 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
 
 
 def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
-    """Of a photo with a lens, the mask that the stages work with, too: the way there and back moves pixels."""
+    """Mask that the stages work with, of a photo with a lens: to distort and to undistort moves pixels."""
     if result.scene.views[view].lens is None:
         return {}
     width, height = result.scene.cameras.sizes[view].tolist()
@@ -209,5 +209,5 @@ def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
 
 
 def _chance_of(result: Result, instance: int) -> float | None:
-    """How likely an instance is a leaf, where the views chose it."""
+    """Probability that an instance is a leaf, where the views chose it."""
     return result.instances.probabilities.get(instance)

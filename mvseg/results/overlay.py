@@ -100,7 +100,7 @@ def find_thickest(mask: np.ndarray) -> tuple[tuple[int, int], float]:
 
 
 def _write(numbers: Sequence[_Number], size: tuple[int, int], *, scale: float) -> np.ndarray:
-    """Where a picture of this width and height has ink (uint8): numbers, smaller on small leaves."""
+    """(height, width) uint8 ink of the numbers in a picture, smaller on small leaves."""
     ink = np.zeros(size[::-1], np.uint8)
     for text, (column, row), radius in numbers:
         own = float(np.clip(2 * radius / CAPITAL, max(0.35, 0.5 * scale), scale))

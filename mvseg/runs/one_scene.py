@@ -95,7 +95,7 @@ def _plan_stages(config: RunConfig, *, finds: bool) -> tuple[str, ...]:
 
 
 def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:
-    """The same with weights that have learned the scene before, in a file in this folder."""
+    """The same options with weights that have learned the scene before, in a file in this folder."""
     if learned.weights is None:
         return config
     path = folder / DETECTOR_FILE

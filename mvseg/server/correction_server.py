@@ -268,7 +268,8 @@ class Corrector(Generic[Kind]):
         publish(Update(self.page_state.update.news, [""] * len(corrections.edits), []), problem)
 
     def _compute_anew(self) -> None:
-        """Ask for the consequences of the edits, for whoever holds the lock; if the detector learns, afterwards."""
+        """Ask for the consequences of the edits; the caller holds the lock. If the detector learns, they come
+        afterwards."""
         wanted = Computing(next(self._numbers))
         if isinstance(self.task, Learning):
             self.task = replace(self.task, then=wanted)
@@ -277,7 +278,7 @@ class Corrector(Generic[Kind]):
         self.news.notify_all()
 
     def _notify(self) -> None:
-        """There is something new to hear of, for whoever holds the lock."""
+        """Announce news; the caller holds the lock."""
         self.number += 1
         self.news.notify_all()
 

@@ -290,7 +290,7 @@ class OpenResult:
         return self._before[1]
 
     def _before_edits(self) -> bytes | None:
-        """What the run knew before edits; None where it said nothing, or where something has changed since."""
+        """State of the run before edits; None if the result lacks it, or if something has changed since."""
         path, said = self.folder / BEFORE_EDITS_FILE, self.run.record
         is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
         return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None

@@ -25,7 +25,7 @@ from mvseg.tracking.track import Tracks, track_leaves
 
 @dataclass(frozen=True, eq=False)
 class _TracksPage:
-    """What a page shows: tracks, and what follows from them for it."""
+    """Content of the page: tracks, and the data that follow from them."""
 
     tracks: Tracks
     data: dict[str, Any]
@@ -103,7 +103,7 @@ class OpenTracks:
         return OpenTracks(self.folder, self.plant.plant)
 
     def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
-        """What the user says, and what hinders each edit; "" for nothing."""
+        """Links of the user, and the problem of each edit; "" for none."""
         links, problems = find_plant_links(corrections.edits, self.dates)
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
@@ -117,7 +117,7 @@ class OpenTracks:
         return track_leaves(self.dates, links=links, pots=self.recorded.pots, plant=self.plant.plant)
 
     def _changes(self, question: Question, links: Sequence[LeafLink]) -> list[str]:
-        """What is different if the tracks are wrong there."""
+        """Differences of the tracks if they are wrong there."""
         with suppress(InputError):  # it contradicts what was said before
             other = question.link(self._shown.tracks, is_same=not question.is_linked)
             return describe_changes(self._shown.tracks, self._track_with([*links, other]))
@@ -134,7 +134,7 @@ def _choose_plant(recorded: RecordedTracks, name: str | None) -> PlantResults:
 
 
 def _describe_question(question: Question) -> dict[str, Any]:
-    """As the page reads it; "changes" are None until they are known."""
+    """A question in the form that the page reads; "changes" are None until they are computed."""
     return {"before": question.before, "after": question.after, "isLinked": question.is_linked,
             "doubt": round(question.doubt, 3), "changes": None}  # fmt: skip
 

@@ -232,7 +232,8 @@ def _size(age: float) -> float:
 
 
 def _age(leaf: Leaf, share: float) -> Leaf:
-    """The leaf after a share of its yellowing: it dries, rolls up a little and hangs down; as it is below 0."""
+    """The leaf after a share of its yellowing: it dries, rolls up a little and hangs down; unchanged for a share below
+    0."""
     if share <= 0:
         return leaf
     rolled = roll_up(leaf.vertices, 1.2 * share)

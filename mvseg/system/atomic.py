@@ -204,7 +204,7 @@ def _beside(place: Path, kind: str) -> Path:
 
 
 def _clear(place: Path) -> None:
-    """Complete, undo or delete what is left of an earlier write, under the lock."""
+    """Complete, undo or delete the remains of an earlier write, under the lock."""
     ready, aside = _beside(place, READY), _beside(place, ASIDE)
     for waiting in [ready] if ready.is_dir() else [aside] if aside.is_dir() else []:
         if os.path.lexists(place):

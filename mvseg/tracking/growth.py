@@ -174,7 +174,7 @@ def _plant_rows(tracks: Tracks, points: Sequence[GrowthPoint]) -> Iterator[Plant
 
 
 def _relative_growth(before: Mapping[int, Number], now: Mapping[int, Number], days: float) -> Number:
-    """Of the tracks that are measured on both dates."""
+    """Relative growth rate of the tracks that are measured on both dates."""
     both = before.keys() & now.keys()
     if not both:
         return NOTHING

@@ -148,7 +148,7 @@ def _describe_plant(growth: Growth) -> dict[str, Any]:
 
 
 def _round(value: float, digits: int) -> float | None:
-    """With so many significant digits; None for what is not finite, which JSON does not know."""
+    """Round to so many significant digits; None for numbers that are not finite, which JSON lacks."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 

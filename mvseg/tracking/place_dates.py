@@ -125,7 +125,7 @@ def _move(
 
 
 def _remembered(poses_of_pairs: PosesOfPairs, habit: Habit) -> Likeliness:
-    """The log odds of two dates standing as poses say; the same step between two dates is looked at once."""
+    """Log odds of the relative pose of two dates; computed once for the same step between the same dates."""
 
     @cache
     def of_step(pair: tuple[int, int], step: bytes) -> float:
@@ -144,7 +144,7 @@ def step_between(poses: Floats, pair: tuple[int, int]) -> Floats:
 
 
 def _gain(pair: Pair, pose: Floats) -> float:
-    """Of a pose (4, 4) of two dates, less what large new leaves cost."""
+    """Gain of a pose (4, 4) of two dates, minus the cost of large new leaves."""
     if not pair.fewer:
         return 0.0
     costs = fitted_costs(pair.moved(pose))

@@ -59,7 +59,7 @@ def _of_links(tracks: Tracks) -> Iterator[Question]:
 
 
 def _of_ends(tracks: Tracks) -> Iterator[Question]:
-    """Of leaves that are gone, with those that appear afterwards."""
+    """Questions about leaves that are gone and leaves that appear afterwards."""
     shaped = [{date.leaves[place].leaf: row for row, place in enumerate(date.shaped)} for date in tracks.dates]
     observations = list(_observations(tracks).values())
     for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in observations for two in observations):
@@ -86,7 +86,7 @@ def describe_changes(now: Tracks, then: Tracks) -> list[str]:
 
 
 def _describe_turns(now: Tracks, then: Tracks) -> Iterator[str]:
-    """Of the dates on which the plant stands otherwise to the one before."""
+    """Sentences about the dates on which the relative pose to the date before differs."""
     for later in range(1, len(now.dates)):
         one, other = (np.linalg.inv(each.poses[later - 1]) @ each.poses[later] for each in (now, then))
         turn = np.degrees(Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).magnitude())

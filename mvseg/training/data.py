@@ -140,7 +140,7 @@ def _list_lone(photos: Path, labels: Path, masks: MaskFiles) -> list[Sample]:
 
 
 def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
-    """Those that a COCO file lists. Classes 1, 2, ... are the categories, ordered by their ids."""
+    """Samples that a COCO file lists. Classes 1, 2, ... are the categories, ordered by their ids."""
     labels, content = masks.source, read_files(masks.files[0], photo_set)
     categories = sorted(content.categories, key=lambda category: (isinstance(category.id, str), category.id))
     if not content.images or not categories:

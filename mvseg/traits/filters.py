@@ -39,7 +39,7 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class _Body:
-    """Where an instance is, and how large.
+    """Place and size of an instance.
 
     Attributes:
         points: (P, 3) on it.

@@ -102,8 +102,8 @@ def _gather(
     is_held: Tensor,
     cache: SurfaceCache | None = None,
 ) -> tuple[Candidates, tuple[Drawn, ...]]:
-    """The instances of the first of these tables, by id, with their surfaces, those of the others, and V views of them
-    all. The tables are of the same D masks with other ids."""
+    """Candidates: the instances of the first table, by id, with their surfaces, then those of the other tables; and V
+    views of all. The tables are of the same D masks with other ids."""
     rows = torch.arange(len(tables[0]))
     candidates = gather_candidates(
         [(each, rows) for each in tables], cameras, table=tables[0], is_held=is_held, surfaces=surfaces, cache=cache

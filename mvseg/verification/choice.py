@@ -169,7 +169,7 @@ def choose(
 def _accept(
     candidates: Candidates, q: Floats, steps: Sequence[Step], statements: Statements, min_probability: float | None
 ) -> _Ranked:
-    """Which candidates are leaves: those that are likely enough, and have masks enough, and what the user says."""
+    """Accept candidates as leaves: those that are likely enough and have enough masks, and those that edits hold."""
     least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
     is_taken = candidates.is_certain.copy()
     for each in steps:

@@ -231,7 +231,7 @@ def gather_candidates(
 def _stem_chances(
     surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
 ) -> Floats:
-    """(K,) probability that each candidate, of these members of R' regions, is a stem."""
+    """(K,) probability that each candidate is a stem; `members` are its rows of R' regions."""
     ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
     tubes = tube_evidence(
         regions.select(torch.cat(list(members))),

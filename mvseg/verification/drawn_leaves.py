@@ -97,9 +97,9 @@ def _views_without(masks: Masks, leaf: int) -> list[int]:
 
 
 def _maybe_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras) -> Tensor:
-    """(D,) bool: which masks of a leaf may show half of it: those that no user drew, confirmed or linked, and where
-    enough more has the colour of leaves and is in no mask of another leaf. None where the user drew the leaf in one
-    view only. (Without such masks, no surface need be fitted.)"""
+    """(D,) bool: masks that may show half a leaf: no user drew, confirmed or linked them, and enough more pixels have
+    the colour of leaves and are in no mask of another leaf. None where the user drew the leaf in one view only.
+    (Without such masks, no surface need be fitted.)"""
     is_own = masks.instance_ids == leaf
     maybe = is_own & ~masks.is_corrected & ~masks.is_linked
     if len(masks.view_index[is_own & (masks.origin == Origin.CORRECTED)].unique()) < 2:
@@ -117,8 +117,8 @@ def _maybe_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cam
 def _drop_halves(
     masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras, cache: SurfaceCache | None
 ) -> Masks:
-    """The masks without those that show half a leaf: the surface that follows from what was drawn alone holds them, and
-    the view shows more than twice as much of it openly, all in the colour of leaves."""
+    """Drop masks that show half a leaf: the surface that follows from the outlines alone contains them, and the view
+    shows more than twice as much of it openly, all in the colour of leaves."""
     maybe = _maybe_halves(masks, leaf, colored, cameras=cameras)
     if not maybe.any():
         return masks
@@ -184,7 +184,7 @@ def _find_parts(remaining: Mapping[int, Frame], around: Mapping[int, Frame]) -> 
 
 
 def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:
-    """The masks with those that the other views show of a leaf."""
+    """Add the masks that the other views show of a leaf."""
     ids, parts = masks.instance_ids.clone(), {}
     for view, (visible, leaf_colored) in _find_open(masks, leaf, surface, cameras=cameras, colored=colored).items():
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
@@ -285,7 +285,7 @@ def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame])
 
 
 def _largest_part(frame: Frame) -> Frame:
-    """The largest part of a mask that hangs together, without what is thinner than three pixels."""
+    """Largest connected part of a mask, without parts thinner than three pixels."""
     opened = cv2.morphologyEx(frame.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     if count < 2:

@@ -94,7 +94,7 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
 
 
 def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
-    """The files below a folder that are neither the scene's cameras nor its photos, nor copies of these."""
+    """Files below a folder, without the scene's cameras, its photos, and copies of these."""
     photos = [view.path for view in scene.views if view.path.is_file()]
     other_files = {path.resolve() for path in (*photos, scene.source) if path is not None}
     of_size: dict[int, list[Path]] = defaultdict(list)

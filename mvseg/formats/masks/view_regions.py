@@ -97,7 +97,7 @@ def _crop_masks(
 
 
 def _without_copies(regions: Regions, *, source: object) -> Regions:
-    """The regions without those that are nearly an earlier one of their view."""
+    """Drop regions that nearly equal an earlier one of their view."""
     is_copy, areas = torch.zeros(len(regions), dtype=torch.bool), regions.areas.tolist()
     for one, other, shared in regions.overlaps():
         if not is_copy[one] and shared >= SAME * (areas[one] + areas[other] - shared):

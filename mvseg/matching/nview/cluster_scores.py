@@ -320,7 +320,7 @@ def best_elsewhere(
 def _look_up(
     cache: dict[Key, Floats], keys: list[Key], compute: Callable[[list[int]], Iterable[Floats]]
 ) -> list[Floats]:
-    """What is cached for the keys; `compute` gives it for the places of missing ones."""
+    """Values of the keys from the cache; `compute` gives those at the places of missing keys."""
     new = [place for place, key in enumerate(keys) if key not in cache]
     if new:
         cache.update(zip((keys[place] for place in new), compute(new), strict=True))

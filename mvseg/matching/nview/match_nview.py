@@ -116,7 +116,7 @@ def find_clusters(
 
 
 def _free_linked(clusters: Clusters, graph: ViewGraph) -> Clusters:
-    """The clusters without the nodes that links name: each of these begins by itself."""
+    """Clusters without the nodes that links name: each of these begins by itself."""
     return Clusters.of(np.where(graph.is_linked, len(clusters) + graph.node, clusters.ids))
 
 

@@ -102,8 +102,8 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
 
 
 def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) -> ViewGains:
-    """What the movers would gain by joining the clusters of the other regions; -inf where they cannot. Of a node of
-    several regions, gains are summed up, scores and coverages are means."""
+    """Gains of the movers from joining the clusters of the other regions; -inf where they cannot. Of a node of several
+    regions, gains are summed up, scores and coverages are means."""
     graph, rest = scores.graph, ids.copy()
     rest[movers.rows] = -1
     numbers = np.unique(rest[rest >= 0])

@@ -159,7 +159,7 @@ def as_tube(points: Floats, distances: Floats) -> Tube:
 def _start_lines(
     first: LeafBases, second: LeafBases, up: Floats | None, *, size: float
 ) -> list[tuple[Floats, Floats]]:
-    """Points and directions of lines that may be near an axis: those that most rays pass, of many."""
+    """Points and directions of lines near which an axis may lie: of many lines, those that most rays pass."""
     bases = first.points
     middle, meeting = np.median(bases, axis=0), _nearest_to_rays(bases, first.ahead)
     along = np.linalg.svd(bases - middle)[2][0]
@@ -200,7 +200,8 @@ def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
 
 
 def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> float:
-    """How badly an axis suits: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3).
+    """Cost of an axis: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3). Leaves in two rows
+    point to any line between the rows: petioles are alike on both sides.
 
     Leaves in two rows point to any line between these: petioles are alike on both sides.
     """
@@ -210,7 +211,7 @@ def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> fl
 
 
 def _lean_cost(ahead: Floats, up: Floats | None, num_leaves: int) -> float:
-    """What an axis along a direction (3,) costs that leans: leaves of two stems also point to lines across both."""
+    """Cost of an axis that leans along a direction (3,): leaves of two stems also point to lines across both."""
     if up is None:
         return 0.0
     cosine = float(ahead @ up) / max(float(np.linalg.norm(ahead)), 1e-300)
@@ -311,8 +312,8 @@ def _look_back(bases: LeafBases, curve: Floats) -> Floats:
 def _nearest_on_rays(
     bases: LeafBases, back: Floats, curve: Floats, t: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Of places t (N, R) on rays, in lengths of the leaves, the one (N,) that is nearest to a curve (P, 3), with its
-    distance (N,) and its place (N,) along the curve."""
+    """Places (N,) on rays that are nearest to a curve (P, 3), among t (N, R) in lengths of the leaves; their distances
+    (N,), and their places (N,) along the curve."""
     rays = bases.points[:, None] + (t * bases.lengths[:, None])[..., None] * back[:, None]
     starts, steps = curve[:-1], np.diff(curve, axis=0)
     size = np.maximum((steps**2).sum(1), 1e-300)

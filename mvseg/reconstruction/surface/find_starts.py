@@ -94,8 +94,7 @@ class _MovedStarts:
 def _try_starts(
     tried: Mapping[int, list[Floats]], few: Sequence[MaskStack], best: Mapping[int, _MovedStarts]
 ) -> dict[int, _MovedStarts]:
-    """What is found of the leaves that are tried: their starts moved half the way to the masks, and those of them all
-    of the way that may become the best."""
+    """Move the starts of these leaves half the way to the masks, and those that may become the best all the way."""
     if not tried:
         return {}
     leaf = np.repeat(list(tried), [len(starts) for starts in tried.values()])
@@ -141,8 +140,8 @@ def wide_cost(coefficients: Floats) -> Floats:
 
 
 def _likely_starts(masks: MaskStack, hull: Hull, *, is_rough: bool) -> list[Floats]:
-    """How well a start explains the masks, before any fit, tells how likely it is. For a rough fit the first one is
-    enough where it shows clearly how the blade lies."""
+    """Sort the starts by how well they explain the masks before any fit. For a rough fit the first one is enough where
+    it clearly shows how the blade lies."""
     starts, ranks = start_in(hull), []
     for start in starts:
         ranks.append(float(_ranks([masks], start[None])[0]))

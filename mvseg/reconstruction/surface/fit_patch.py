@@ -128,10 +128,13 @@ def _from_unit_worlds(coefficients: Floats, starts: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """What the outlines ask of the coefficients of L patches.
+    """Equations of the outlines for the coefficients of L patches.
 
-    Where they are, distances (N,) without the offsets of masks, in pixels, weights (N,), and by how much the masks of
-    each leaf are worse than clean ones (L,), at least 1.
+    Attributes:
+        distances: of N samples, with their places and derivatives.
+        px: (N,) the same without the offsets of masks, pixels.
+        weight: (N,)
+        noise: (L,) errors of the masks of each leaf, in those of clean masks, at least 1.
     """
 
     distances: Distances

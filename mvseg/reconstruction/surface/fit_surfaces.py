@@ -123,8 +123,8 @@ class _Asked:
 
 @dataclass(frozen=True, eq=False)
 class _AskedAgain:
-    """A leaf to be fitted for the second time: how its masks err, and the grids (rows, columns, 3) of those leaves that
-    may hide it."""
+    """A leaf to be fitted for the second time, with the errors of its masks, and the grids (rows, columns, 3) of the
+    leaves that may hide it."""
 
     name: str
     masks: MaskStack
@@ -139,7 +139,7 @@ def _fit_new(
     fit: Callable[[Sequence[Any]], list[Any]],
     workers: ProcessPoolExecutor | None,
 ) -> None:
-    """Fit what is not in the cache yet, `SEARCH.at_once` leaves at a time."""
+    """Fit the leaves that the cache lacks, `SEARCH.at_once` at a time."""
     new = {name: each for name, each in asked.items() if name not in cache}
     leaves, rest = [*new.values()], range(0, len(new), SEARCH.at_once)
     answers = chain.from_iterable(map_in_order(fit, (leaves[n : n + SEARCH.at_once] for n in rest), workers))
@@ -201,7 +201,8 @@ def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
 
 
 def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:
-    """The masks that show each leaf, and a fit from a start that is nearly right or from those that are found.
+    """The right masks of each leaf, and a fit from its start, or the best of several fits from starts that are searched
+    for. The spread of a fit is that of the areas of nearly equally good ones.
 
     Of several fits the best one, and how far the areas of nearly as good ones are from its own.
     """
@@ -227,7 +228,7 @@ def _best_fit(masks: MaskStack, fits: list[PatchFit]) -> PatchFit | None:
 
 
 def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
-    """As `find_starts` ranks, but finely, by the mean IoU: of fits nearly as good, medians pick one by chance."""
+    """Rank as in `find_starts`, but by the mean IoU: among nearly equal fits, medians decide by chance."""
     points = patch_grid(*FIT.grid).points(fit.coefficients)
     ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
     return float(ious.mean() - wide_cost(fit.coefficients))
@@ -255,7 +256,7 @@ def stack_instance(members: Regions, cameras: Cameras, frames: list[np.ndarray],
 
 
 def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
-    """Leaves fitted to what is their rim, now that all leaves and the errors of the masks are known."""
+    """Fit leaves to their own rims, given all leaves and the errors of the masks."""
     surfaces = []
     for each in asked:
         first, coefficients = each.approach, each.approach.coefficients.numpy()
@@ -269,7 +270,7 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
-    """What a fit found; `offsets` (S,) are those of the first one."""
+    """Surface of a fit; `offsets` (S,) are those of the first fit."""
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "shape_unknown", "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)

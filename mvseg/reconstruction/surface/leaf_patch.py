@@ -195,7 +195,8 @@ def _speed_rows() -> Floats:
 
 
 def _frame_counts() -> tuple[int, ...]:
-    """How many directions the prior needs, evenly spaced along the leaf: for Q, R, S, and for the ends of pieces."""
+    """Numbers of directions that the prior needs, evenly spaced along the leaf: for Q, R, S, and for the ends of
+    pieces."""
     return *COUNTS[1:], PRIOR.num_pieces + 1
 
 
