@@ -871,7 +871,7 @@ def test_a_detector_that_finds_nothing_says_so(tmp_path: Path, capsys: pytest.Ca
     plant = write_scene(tmp_path / "plant", 2)
     command = ["infer", str(plant), *SMALL, "--detect.min_score", "1", "--quiet", "--out", str(tmp_path / "out")]
     assert main([*command, *COARSE]) == 0
-    assert "the detector finds nothing that scores 1 or more" in capsys.readouterr().err
+    assert "no detection scores 1 or more" in capsys.readouterr().err
 
 
 def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

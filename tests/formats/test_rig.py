@@ -100,8 +100,8 @@ def test_unknown_keys_are_warned_of(tmp_path: Path) -> None:
     assert all(one.category is InputWarning for one in caught)
     found = [str(one.message).split(": ", 1)[1] for one in caught]
     assert found == [
-        "key 'author' of the rig is not known and not used",
-        "key 'distorsion' of view 3 is not known and not used",
+        "unknown key 'author' of the rig is ignored",
+        "unknown key 'distorsion' of view 3 is ignored",
     ]
 
 
