@@ -178,9 +178,7 @@ def mask_samples(each: Study, fitted: LeafScores) -> list[tuple[np.ndarray, np.n
     return [(features[0][near], is_right[near]), (features[1][own], is_right[own])]
 
 
-def leaf_samples(
-    each: Study, candidates: Candidates, fitted: LeafScores
-) -> list[tuple[bool, np.ndarray, bool, float]]:
+def leaf_samples(each: Study, candidates: Candidates, fitted: LeafScores) -> list[tuple[bool, np.ndarray, bool, float]]:
     """Of each candidate, as the choice met it: whether it has a surface, its features, whether it is a leaf that none
     before it is, and P."""
     samples, seen = [], set()

@@ -67,9 +67,7 @@ ABLATIONS: dict[str, tuple[Any, Mapping[str, float]]] = {
     "pieces alone": (PIECES, {"covered": math.inf}),
     "few views kept": (PIECES, {"few_covered": math.inf}),
 }
-METHODS |= {
-    name: partial(ablated_ids, numbers=numbers, values=values) for name, (numbers, values) in ABLATIONS.items()
-}
+METHODS |= {name: partial(ablated_ids, numbers=numbers, values=values) for name, (numbers, values) in ABLATIONS.items()}
 
 
 def run_scene(spec: SceneSpec, *, cache: Path, methods: Iterable[str], kinds: Iterable[str]) -> list[dict[str, Any]]:

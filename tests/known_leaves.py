@@ -51,9 +51,7 @@ def bent_sheet(radius: float) -> Sheet:
 def folded_sheet(angle_deg: float) -> Sheet:
     """Two flat halves, turned up, at this angle to each other."""
     lift = np.radians(90 - angle_deg / 2)
-    return lambda along, across: np.stack(
-        [along, across * np.cos(lift), np.abs(across) * np.sin(lift)], -1
-    )
+    return lambda along, across: np.stack([along, across * np.cos(lift), np.abs(across) * np.sin(lift)], -1)
 
 
 def flat_leaf(

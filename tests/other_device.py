@@ -36,9 +36,7 @@ class OtherTensor(Tensor):
 
     @staticmethod
     def __new__(cls, inner: Tensor) -> OtherTensor:
-        made = Tensor._make_wrapper_subclass(
-            cls, inner.shape, strides=inner.stride(), dtype=inner.dtype, device=DEVICE
-        )
+        made = Tensor._make_wrapper_subclass(cls, inner.shape, strides=inner.stride(), dtype=inner.dtype, device=DEVICE)
         made.inner = inner
         return made
 

@@ -67,7 +67,7 @@ class Lesson:
             while not self.go_on.wait(0.02):
                 if is_old():
                     raise Cancelled
-            plant, said = opened._found
+            plant, said = opened._plant_before
             opened.learned = replace(plant, learned=Learned(weights=b"learned", rounds=1)), said
 
         monkeypatch.setattr(OpenResult, "learn", learn)
@@ -85,7 +85,7 @@ class SlowLook:
                 assert go_on.wait(WAIT)
             return match_given(opened.opened), []
 
-        monkeypatch.setattr(OpenResult, "_found", property(look))
+        monkeypatch.setattr(OpenResult, "_plant_before", property(look))
         monkeypatch.setattr("mvseg.server.correction_server.STEP_SECONDS", 0.0)
 
 

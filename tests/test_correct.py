@@ -285,7 +285,7 @@ def test_it_opens_with_what_the_run_knew_before_edits(
     place, computed = tmp_path / "result", list[Any]()
     shutil.copytree(folder, place)
     monkeypatch.setattr(open_result, "match_given", lambda opened: computed.append(opened) or match_given(opened))
-    plant, said = OpenResult(place)._found
+    plant, said = OpenResult(place)._plant_before
     anew = match_given(OpenResult(place).opened)
     assert (computed, said) == ([], [])
     assert torch.equal(plant.masks.instance_ids, anew.masks.instance_ids)
@@ -293,12 +293,12 @@ def test_it_opens_with_what_the_run_knew_before_edits(
     assert plant.disagreement == anew.disagreement
     with monkeypatch.context() as patch:
         patch.setattr(torch, "__version__", "0.0")
-        assert len(OpenResult(place)._found[0].masks) == len(plant.masks)
+        assert len(OpenResult(place)._plant_before[0].masks) == len(plant.masks)
     opened = OpenResult(place)
     opened._changes.append(Finding("input_changed", "masks"))
-    assert len(opened._found[0].masks) == len(plant.masks)
+    assert len(opened._plant_before[0].masks) == len(plant.masks)
     (place / BEFORE_EDITS_FILE).write_bytes(b"another")
-    assert len(OpenResult(place)._found[0].masks) == len(plant.masks)
+    assert len(OpenResult(place)._plant_before[0].masks) == len(plant.masks)
     assert len(computed) == 3
 
 
@@ -433,7 +433,7 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     [
         ({"refine_poses": False, "detect": {"min_views": 2}}, None),  # as everybody had them
         ({"refine_poses": True}, "its poses were refined by the masks, and will be those of the scene"),
-        ({"detect": {"min_views": 1}}, "it has leaves by another number of photos"),
+        ({"detect": {"min_views": 1}}, "made with another min. number of photos"),
     ],
 )
 def test_a_result_made_with_options_that_are_gone(

@@ -132,9 +132,7 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor]) -> 
     assert torch.equal(found.instance_ids, expected.instance_ids)
 
 
-def test_leaves_are_chosen_on_the_cpu(
-    model: MaskRCNN, photos: list[Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
 

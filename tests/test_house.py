@@ -165,6 +165,20 @@ def test_vague_names_live_for_three_lines_at_most() -> None:
     assert lasting == set()
 
 
+def test_fields_arguments_and_definitions_have_no_vague_names() -> None:
+    vague = set()
+    for module, source in MODULES.items():
+        for node in ast.walk(ast.parse(source)):
+            names = [node.name] if isinstance(node, ast.FunctionDef | ast.ClassDef) else []
+            if isinstance(node, ast.FunctionDef | ast.Lambda):
+                names += [each.arg for each in (*node.args.args, *node.args.kwonlyargs)]
+            if isinstance(node, ast.ClassDef):
+                fields = [each.target for each in node.body if isinstance(each, ast.AnnAssign)]
+                names += [each.id for each in fields if isinstance(each, ast.Name)]
+            vague |= {(module, name) for name in names if name.strip("_").lower() in VAGUE}
+    assert vague == set()
+
+
 def test_public_names_are_given_once() -> None:
     """But for verbs of the command line, which have the same functions."""
     places: dict[str, list[str]] = {}

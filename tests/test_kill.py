@@ -114,7 +114,7 @@ def earlier(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", ["infer", "detect"])
 def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: Path) -> None:
-    """"detect" is `mvseg infer` without masks, whose detections are kept until it is done."""
+    """ "detect" is `mvseg infer` without masks, whose detections are kept until it is done."""
     plant, out = write_scene(tmp_path / "plant", 3 if verb == "infer" else 2), tmp_path / "out"
     place = out / "plant"
     coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--out", str(place), "--quiet"]
@@ -148,9 +148,7 @@ def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_batch_goes_on_where_it_was_killed(
-    runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_batch_goes_on_where_it_was_killed(runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each result is old or new, and in the end all tables are those of a batch that was never disturbed."""
     names, out, earlier = ("aloe", "basil", "mint"), tmp_path / "out", tmp_path / "earlier"
     plants = [write_scene(tmp_path / "plants" / name, 2 + number % 2) for number, name in enumerate(names)]
@@ -186,9 +184,7 @@ def test_a_batch_goes_on_where_it_was_killed(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [2] if KILLS < 5 else [0, 2])
-def test_a_resumed_training_run_ends_as_one_that_was_never_killed(
-    num_workers: int, runs: Runs, tmp_path: Path
-) -> None:
+def test_a_resumed_training_run_ends_as_one_that_was_never_killed(num_workers: int, runs: Runs, tmp_path: Path) -> None:
     photos, labels = write_photos(tmp_path, 6)
     options = {"photos": photos, "labels": labels, "hold_out_every": 3, "image_size": 64, "epochs": 2, "batch_size": 2}
     options |= {"num_workers": num_workers, "device": "cpu", "checkpoint_every": 1, "log_every": 1, "ema_decay": 0.5}

@@ -359,7 +359,6 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
     assert len(whole.masks.merged) == 1
 
 
-
 @pytest.mark.slow
 def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path: Path) -> None:
     whole = load_scene(demo_scene())

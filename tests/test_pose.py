@@ -40,9 +40,7 @@ def write_positions(path: Path) -> Path:
     return path
 
 
-def test_a_folder_of_photos_becomes_a_scene(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_photos_becomes_a_scene(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, positions = tmp_path / "scene", write_positions(tmp_path / "log.csv")
     command = ["pose", str(photos), "--out", str(out), "--positions", str(positions), "--up", "0 0 1"]
     assert main(command) == 0

@@ -32,9 +32,7 @@ def write_photos(folder: Path, photos: list[np.ndarray]) -> Path:
     return folder
 
 
-def test_a_table_is_calibrated_once_and_serves_other_photos(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_is_calibrated_once_and_serves_other_photos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     empty = np.full((HEIGHT, WIDTH), 90, np.uint8)
     photos = write_photos(tmp_path / "photos", [*(draw_board(angle) for angle in ANGLES), empty])
     table = tmp_path / "table"
@@ -144,9 +142,7 @@ def test_two_cameras_and_other_angles(tmp_path: Path, capsys: pytest.CaptureFixt
         (["--turntable", "nowhere.json"], "nowhere.json: cannot be read"),
     ],
 )
-def test_wrong_options(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
-) -> None:
+def test_wrong_options(tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str) -> None:
     photos = write_photos(tmp_path / "photos", [np.zeros((20, 30), np.uint8)] * 4)
     assert main(["pose", str(photos), "--out", str(tmp_path / "out"), *options]) == 2
     assert message in capsys.readouterr().err

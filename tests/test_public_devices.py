@@ -69,7 +69,6 @@ def scene_there(cameras: Cameras) -> Scene:
     return Scene("balls", views, cameras)
 
 
-
 @cache
 def surfaces() -> dict[int, LeafSurface]:
     return fit_surfaces(SCENE.regions, IDS, SCENE.cameras)

@@ -171,9 +171,7 @@ def test_a_page_printed_at_97_percent_is_noticed(
         assert shape["num_views"] == shape["num_masks"] >= 4
 
 
-def test_a_photo_without_shapes_is_named(
-    two_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_photo_without_shapes_is_named(two_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Printed without colour: its tags are found, its shapes are not."""
     folder = Path(shutil.copytree(two_photos, tmp_path / "page"))
     path = folder / "images" / "01.jpg"

@@ -14,17 +14,17 @@ from dataclasses import dataclass
 class CameraNumbers:
     """Cameras on their own."""
 
-    most_sources: int = 32  # limit: cameras whose rays give candidate points, at most
+    most_sources: int = 32  # limit: max. cameras whose rays give candidate points
     points_at_once: int = 4096  # limit: candidate points at a time; their number bounds the memory
-    all: float = 0.9  # chosen: share of the cameras that look at one point, at least, if poses are right
+    all: float = 0.9  # chosen: min. share of the cameras that look at one point, if poses are right
     most: float = 0.6  # chosen: the same, below which another reading of the poses that is right is the better one
     wider: int = 4  # chosen: factor of the angle between cameras from which such a reading is the better one, too
     field_of_view: tuple[float, float] = (2.0, 140.0)  # chosen: degrees along the diagonal, no fisheyes
-    off_center: float = 0.2  # chosen: distance of a principal point from the middle, as a share of the side, at most
-    square: float = 1.2  # chosen: quotient of the focal lengths along x and y, at most
-    far: float = 8.0  # chosen: distance of a camera from the middle of the others, in their median distance, at most
-    gap: float = 3.0  # chosen: quotient of two lengths of t between which the unit may change, at least
-    alike: float = 2.0  # chosen: quotient of the distances of two groups of cameras in one unit, at most
+    off_center: float = 0.2  # chosen: max. distance of a principal point from the middle, as a share of the side
+    square: float = 1.2  # chosen: max. quotient of the focal lengths along x and y
+    far: float = 8.0  # chosen: max. distance of a camera from the middle of the others, in their median distance
+    gap: float = 3.0  # chosen: min. quotient of two lengths of t between which the unit may change
+    alike: float = 2.0  # chosen: max. quotient of the distances of two groups of cameras in one unit
     narrow: float = 2.0  # chosen: degrees between the most different rays, below which there is no depth
     wide: float = 75.0  # chosen: degrees between the rays of neighbouring views, above which they share no leaves
 
@@ -44,7 +44,7 @@ class AgreementNumbers:
     few_masks: int = 10  # chosen: masks of two views (median), to be sure; of fewer, one faulty mask is too many
     few_views: int = 4  # chosen: views to be sure: of fewer, none is outvoted
     chance: float = 0.06  # chosen: share of the masks that fit where poses and masks have nothing to do with each other
-    apart: float = 0.5  # chosen: fitting share between two worlds, relative to that within them, at most
+    apart: float = 0.5  # chosen: max. fitting share between two worlds, relative to that within them
     smallest: int = 2  # definition: views of a group; one alone is for `view_agreement`
     # On 65 real plants and dates with sound masks it is 0.47 and more, but for 0.28 on a basil of 30 leaves that hide
     # each other; where the masks of a simulated plant are turned, it is 0.29 and 0.26.
@@ -57,36 +57,36 @@ class FeatureNumbers:
     """Features of photos against cameras."""
 
     side: int = 800  # limit: pixels of the longer side of photos in which features are found
-    most_features: int = 1500  # limit: features of a photo, at most
-    contrast: float = 0.013  # chosen: contrast of a feature, at least: leaves have less than OpenCV's default of 0.04
+    most_features: int = 1500  # limit: max. features of a photo
+    contrast: float = 0.013  # chosen: min. contrast of a feature: leaves have less than OpenCV's default of 0.04
     best_angle: float = 15.0  # chosen: degrees between two views that are matched: above, fewer features are the same
     widest_angle: float = 60.0  # chosen: the same, at most
     partners: int = 4  # chosen: views that a view is matched with: wrong cameras are wrong about what is near, too
-    most_views: int = 24  # limit: views of which each is matched with others, at most
+    most_views: int = 24  # limit: max. views of which each is matched with others
     sources: int = 8  # limit: views that are matched with others where there are more
     still: float = 3.0  # chosen: units up to which features stand still, as the wall behind a turntable
     tolerance: float = 1.0  # chosen: units that a feature may miss a fundamental matrix by
-    fewest: int = 20  # chosen: features that fit one fundamental matrix, at least; 40 with nothing in common give 13
+    fewest: int = 20  # chosen: min. features that fit one fundamental matrix; 40 with nothing in common give 13
     least_share: float = 0.5  # chosen: the same, as a share of all features that have moved
     offset: float = 1.5  # chosen: units that features of right cameras may miss their epipolar lines by
     contradicts: float = 0.3  # chosen: share of features on the lines of the cameras, below which these are wrong
     agrees: float = 0.6  # chosen: the same, above which they agree
-    fewest_pairs: int = 3  # chosen: pairs of photos that judge a focal length, at least
-    least_error: float = 0.05  # chosen: change of its logarithm, at least
-    better: float = 0.5  # chosen: epipolar distance with another focal length, in that with the given one, at most
-    most: float = 0.7  # chosen: share of the pairs for which it is better, and in which features fit, at least
+    fewest_pairs: int = 3  # chosen: min. pairs of photos that judge a focal length
+    least_error: float = 0.05  # chosen: min. change of its logarithm
+    better: float = 0.5  # chosen: max. epipolar distance with another focal length, in that with the given one
+    most: float = 0.7  # chosen: min. share of the pairs for which it is better, and in which features fit
 
 
 @dataclass(frozen=True)
 class PhotoNumbers:
     """Masks and photos on their own, and shapes of the target in photos."""
 
-    tiny_px: int = 30  # chosen: pixels of a mask that carries information, at least
+    tiny_px: int = 30  # chosen: min. pixels of a mask that carries information
     many: float = 0.25  # chosen: share of the masks that are tiny or cut by the border, above which a user is told
     few: float = 0.34  # chosen: masks of a view, in their median number, below which some may be missing
     small_component: float = 0.002  # chosen: component that does not count, relative to its mask's pixels
-    beyond: float = 0.1  # chosen: reach of stray pixels beyond a mask, as a share of the photo's longer side, at most
-    blank: float = 4.0  # chosen: standard deviation of grey levels of a photo of nothing, at most
+    beyond: float = 0.1  # chosen: max. reach of stray pixels beyond a mask, as a share of the photo's longer side
+    blank: float = 4.0  # chosen: max. standard deviation of grey levels of a photo of nothing
     blank_share: float = 0.03  # chosen: the same of a dark photo, relative to its level; real photos have 0.2
     rounding: float = 1.0  # definition: the same that rounding makes
     dark: int = 30  # chosen: grey level below which 99 % of the pixels of a dark photo are

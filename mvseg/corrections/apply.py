@@ -272,9 +272,7 @@ def _ties_of_words(words: Sequence[tuple[str, int, Key]], place: Mapping[Key, in
     return ties
 
 
-def _tell_of_parts(
-    edited: _Edited, masks: Sequence[EditedMask], component: NDArray[np.int64], scene: Scene
-) -> _Edited:
+def _tell_of_parts(edited: _Edited, masks: Sequence[EditedMask], component: NDArray[np.int64], scene: Scene) -> _Edited:
     """Find masks of one photo that edits make one leaf, but that do not touch; the last of these edits reports it."""
     group_of = {mask.key: int(group) for mask, group in zip(masks, component, strict=True)}
     groups: dict[tuple[int, int], list[EditedMask]] = {}

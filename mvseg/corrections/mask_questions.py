@@ -48,7 +48,7 @@ class MaskQuestion:
         instance: id of the leaf; -1 for "unmatched" without a guess, for "place" and "leaf".
         region: row of the mask; -1 for "place", "missing" and "leaf".
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
-        found, expected: number of views that have a mask of the leaf, and that should; of "half", those that have half
+        num_found, num_expected: views that have a mask of the leaf, and that should; of "half", those that have half
             a mask, and that have any.
         size: area of its place, relative to a usual mask, at most 1.
         outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
@@ -61,15 +61,15 @@ class MaskQuestion:
     instance: int
     region: int = -1
     other: int = -1
-    found: int = 0
-    expected: int = 0
+    num_found: int = 0
+    num_expected: int = 0
     outlines: Outlines = ()
     size: float = 1.0
 
     @property
     def change(self) -> float:
         """How many usual masks an answer is expected to change."""
-        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), QUESTIONS.digits)
+        return round(self.doubt * self.size * max(1, self.num_found, len(self.outlines)), QUESTIONS.digits)
 
 
 def list_mask_questions(
@@ -175,10 +175,9 @@ def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> l
         places = [part for part in places if part.row < 0 or ids[part.row] != instance]
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
-        questions.append(
-            MaskQuestion("half", 1.0, largest.view, instance, region=largest.row, found=len(views),
-                  expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
-        )  # fmt: skip
+        num_all = len(masks.view_index[masks.instance_ids == instance].unique())
+        half = MaskQuestion("half", 1.0, largest.view, instance, region=largest.row, outlines=outlines)
+        questions.append(replace(half, num_found=len(views), num_expected=num_all))
     if len({part.view for part in places}) > 1:  # two outlines are a leaf
         outlines = tuple((part.view, part.outline) for part in places[: QUESTIONS.most_places])
         questions.append(MaskQuestion("place", 1.0, outlines[0][0], -1, outlines=outlines))
@@ -283,5 +282,6 @@ def _ask_rare(masks: Masks, should: Bools) -> list[MaskQuestion]:
         expected = views | set(np.flatnonzero(should[instance]).tolist())
         number = len(expected) if should[instance].any() else masks.regions.num_views
         doubt, view = 1 - len(views) / number, int(masks.view_index[best])
-        questions.append(MaskQuestion("few", doubt, view, instance, region=best, found=len(views), expected=number))
+        few = MaskQuestion("few", doubt, view, instance, region=best)
+        questions.append(replace(few, num_found=len(views), num_expected=number))
     return questions

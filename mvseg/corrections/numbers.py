@@ -12,23 +12,23 @@ from dataclasses import dataclass
 class EditNumbers:
     """Limits of a file of corrections, masks that an edit is about, and rough outlines."""
 
-    most_bytes: int = 64 * 2**20  # limit: size of the file, at most
-    most_edits: int = 10_000  # limit: edits of a file, and photos that it names, at most
-    most_points: int = 10_000  # limit: points of an outline or a line, and places of a link of dates, at most
-    most_places: int = 100  # limit: places of a link, at most: each is held against each other
+    most_bytes: int = 64 * 2**20  # limit: max. size of the file
+    most_edits: int = 10_000  # limit: max. edits of a file, and photos that it names
+    most_points: int = 10_000  # limit: max. points of an outline or a line, and places of a link of dates
+    most_places: int = 100  # limit: max. places of a link: each is held against each other
     covered: float = 0.5  # definition: share of a mask above which an outline that covers it replaces it
     most_covered: int = 3  # chosen: masks that an outline replaces silently: two stems make three pieces
     least_halves: int = 2  # chosen: photos that show two instances, from which a link between them may be about both
     touches: float = 0.02  # chosen: distance of the surfaces of two halves, in lengths of the first
-    as_near: float = 1.1  # chosen: distance of the outline of one surface that fits as well as two, in theirs, at most
+    as_near: float = 1.1  # chosen: max. distance of the outline of one surface that fits as well as two, in theirs
     fine: int = 4  # limit: bits of a pixel's fraction, along a cut
-    touches_px: int = 2  # chosen: gap between two masks of one leaf in one photo, at most, where they hang together
+    touches_px: int = 2  # chosen: max. gap between two masks of one leaf in one photo, where they hang together
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
     around: float = 0.35  # chosen: margin around the rough outline that is part of it, as a share of its size
     least_margin_px: float = 4.0  # chosen: the same in pixels of the photo, at least
-    least_pixels: int = 16  # chosen: pixels of that part within the rough outline, at least
+    least_pixels: int = 16  # chosen: min. pixels of that part within the rough outline
     rounds: int = 5  # limit: rounds of GrabCut
-    least_leaf: float = 0.05  # chosen: size of the leaf, as a share of the rough outline's pixels, at least
+    least_leaf: float = 0.05  # chosen: min. size of the leaf, as a share of the rough outline's pixels
     tolerance_px: float = 1.0  # chosen: distance of the outline from the leaf's edge, pixels of the part
 
 
@@ -37,22 +37,22 @@ class QuestionNumbers:
     """Questions to the user, also about leaf-coloured places without a mask. Doubts only sort questions."""
 
     least: float = 0.3  # chosen: doubt from which a question is asked
-    most: int = 200  # limit: questions of a page, at most: it asks a few itself, and the others where the user clicks
+    most: int = 200  # limit: max. questions of a page: it asks a few itself, and the others where the user clicks
     digits: int = 6  # limit: decimals of the change by an answer; later ones make a tie
     as_good: float = 0.1  # chosen: match score below the best from which masks are as good; the largest is shown
     open: float = 0.5  # chosen: unhidden share of a surface that should have a mask; see `EVIDENCE.open_pixels`
     empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one
     surely: float = 0.8  # chosen: the same, from which nothing else is likelier
-    smooth_px: float = 1.5  # chosen: distance of a proposed outline from the edge that it follows, at most
+    smooth_px: float = 1.5  # chosen: max. distance of a proposed outline from the edge that it follows
     least_chance: float = 0.1  # chosen: P from which a candidate that was not chosen is asked about
     half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
     least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf
-    most_places: int = 12  # limit: places that one question shows, at most
+    most_places: int = 12  # limit: max. places that one question shows
     search_px: int = 600  # limit: longer side of a photo in which places are looked for
-    opening: int = 5  # chosen: width of a place in these pixels, at least: stems are thinner, and seams beside masks
-    compact: float = 0.25  # chosen: square of its largest width, as a share of its area, at least: stems have less
-    beside: int = 3  # chosen: distance between a mask and what it leaves out of its leaf, in these pixels, at most
+    opening: int = 5  # chosen: min. width of a place in these pixels: stems are thinner, and seams beside masks
+    compact: float = 0.25  # chosen: min. square of its largest width, as a share of its area: stems have less
+    beside: int = 3  # chosen: max. distance between a mask and what it leaves out of its leaf, in these pixels
     most_share: float = 0.2  # chosen: size of a place, relative to the photo; of larger ones the widest place
     widest: float = 1.5  # chosen: reach of that place from its middle, in radii of the largest circle in it
 

@@ -22,13 +22,13 @@ class DetectionNumbers:
     clear_agreement: float = 0.85  # chosen: the same, from which one smaller size without growth ends the search
     brightest: float = 1.5  # limit: pixel value above which photos are not in [0, 1]; resampling may exceed 1
     # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
-    sure_score: float = 0.3  # insensitive: score of the proposals that are matched first, at least
-    more_score: float = 0.1  # chosen: score of proposals that are matched for more candidates, at least
-    least_score: float = 0.05  # definition: score of the whole excessive set, at least: torchvision's threshold
+    sure_score: float = 0.3  # insensitive: min. score of the proposals that are matched first
+    more_score: float = 0.1  # chosen: min. score of proposals that are matched for more candidates
+    least_score: float = 0.05  # definition: min. score of the whole excessive set: torchvision's threshold
     most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
-    mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most
+    mask_pixels: int = 1024  # limit: max. pixels of a proposal's mask that send out epipolar lines
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
-    plant_views: int = 3  # chosen: views of an instance that is part of the plant, at least; all where there are fewer
+    plant_views: int = 3  # chosen: min. views of an instance that is part of the plant; all where there are fewer
     plant_margin: float = 0.1  # chosen: margin around the plant, as a share of its box's longer side: missed leaves
     least_gain: float = 1.5  # chosen: run a second pass only if it magnifies the plant by this factor (median photo)
 

@@ -16,10 +16,10 @@ class EpipolarNumbers:
 
     line_px: float = 2.0  # definition: thickness of an epipolar line (Sec. 3.1)
     bins_per_pixel: int = 2  # insensitive: angular bins: half a pixel wide, so that a line of two pixels is resolved
-    min_bins: int = 64  # limit: angular bins of a pencil, at least
+    min_bins: int = 64  # limit: min. angular bins of a pencil
     max_bins: int = 8192  # limit: the same, at most
     pitch_pixels: int = 1024  # limit: pixels of a view that tell how thick a line is, at least about
-    run_px: int = 16  # limit: length of a run along a row of a mask, at most: epipolar angles change evenly on it
+    run_px: int = 16  # limit: max. length of a run along a row of a mask: epipolar angles change evenly on it
     wide: float = 0.25  # limit, radians: change of angle along a run from which its pixels count one by one
     share: int = 4096  # limit: parts of a pixel that whole numbers count
     coincident: float = 1e-6  # limit: shortest baseline with epipolar geometry, as a share of the longest
@@ -52,7 +52,7 @@ class SweepNumbers:
     """Hypotheses of the plane sweep. A third more or less changes at most one id on masks of 8 and 16 leaves."""
 
     max_empty: float = 0.5  # insensitive: views that see a hypothesis but have no region there: -0.005, 0
-    rays: int = 24  # limit: rays per region, at most: +0.001, +0.007
+    rays: int = 24  # limit: max. rays per region: +0.001, +0.007
     plenty: int = 10  # limit: views up to which all these rays are cast; with more, each ray shows more
     depths: int = 96  # limit: depths along a ray: -0.034, -0.019
     nearest: float = 0.05  # limit: smallest depth, as a share of the longest baseline
@@ -73,8 +73,8 @@ class EMNumbers:
     # chosen: iteration to cluster, and where linkage stops
     starts: tuple[tuple[int, float], ...] = ((-1, 0.3), (1, 0.1))
     many_views: int = 8  # chosen: views up to which there is a second start
-    pixels: int = 12  # limit: pixels per region, at most
-    views: int = 30  # limit: views of a hypothesis that are compared with each other, at most
+    pixels: int = 12  # limit: max. pixels per region
+    views: int = 30  # limit: max. views of a hypothesis that are compared with each other
     negligible: float = 1e-5  # limit: belief up to which a hypothesis is left out
 
 
@@ -110,13 +110,13 @@ class GainNumbers:
 class PieceNumbers:
     """When a mask shows a part of an instance, or two of them: segmenters split leaves, and merge them."""
 
-    covered: float = 0.05  # chosen: share of a second region in a view that its cluster covers, at least
+    covered: float = 0.05  # chosen: min. share of a second region in a view that its cluster covers
     as_good: float = 0.5  # chosen: score from which a cluster explains a region, relative to its own ones
     few: float = 0.25  # chosen: share of the views up to which a cluster that they show is doubted
     few_covered: float = 0.02  # chosen: share of a doubted cluster's region for another cluster to take it over
     merged_coverage: float = 0.25  # chosen: share of another cluster's region from which one may share it
-    merged_share: float = 0.2  # definition: share of a mask's pixels that each of its two instances explains, at least
-    least_score: float = 0.05  # limit: score of the best region that others are compared with, at least
+    merged_share: float = 0.2  # definition: min. share of a mask's pixels that each of its two instances explains
+    least_score: float = 0.05  # limit: min. score of the best region that others are compared with
     neighbours: int = 3  # insensitive: nearest sampled pixels that decide where a merged mask is cut: no id
     # A higher one, and ids of degraded masks lose more than strangers go.
     least: float = 0.3  # insensitive: probability of being a piece below which a mask leaves: -0.005, +0.010
@@ -155,7 +155,7 @@ class DisagreementNumbers:
     """
 
     trusted: float = 0.75  # chosen: mean match score from which ids are taken for right
-    alike: float = 0.7  # chosen: explained share of an odd view, relative to the median view, at most
+    alike: float = 0.7  # chosen: max. explained share of an odd view, relative to the median view
     min_views: int = 4  # limit: views from which one of them can be told to be odd
 
 

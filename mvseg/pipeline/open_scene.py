@@ -128,8 +128,9 @@ def open_scene(
             stems = stems.of_views(taken) if left_out else stems
             both = Masks.concatenate((given, Masks.of(stems, classes=torch.full((len(stems),), STEM_CLASS))))
             given = both.select(both.view_index.argsort(stable=True))
-        return Opened(scene, photos, given, mask_kind=mask_files.kind, views_left_out=left_out, config=config,
-        inputs=inputs)
+        return Opened(
+            scene, photos, given, mask_kind=mask_files.kind, views_left_out=left_out, config=config, inputs=inputs
+        )
 
 
 def _hash_masks(masks: Path) -> str:

@@ -12,15 +12,15 @@ from dataclasses import dataclass
 class StructureNumbers:
     """Cameras from photos alone."""
 
-    least: int = 3  # limit: photos, at least: structure from motion needs as many
+    least: int = 3  # limit: min. photos: structure from motion needs as many
     least_share: float = 0.6  # chosen: share of the photos that must register, unless `min_registered` says otherwise
     enough: float = 0.9  # chosen: share of photos below which more features are found; at 1, blur costs minutes
     few_features: int = 300  # chosen: features below which a photo has too little texture
     quick_size: int = 1600  # limit: pixels of the longer side at first; a third more takes twice as long
     quick_most: int = 4096  # limit: features of a photo at first; a third more take half as long again to match
     contrast: float = 0.02  # definition: COLMAP's contrast of a feature; a third less finds more, and more noise
-    edge: float = 10.0  # definition: ratio of curvatures of a feature, at most: Lowe's and COLMAP's
-    ratio: float = 0.8  # definition: distance of the best match, in that of the second best, at most: Lowe's
+    edge: float = 10.0  # definition: max. ratio of curvatures of a feature: Lowe's and COLMAP's
+    ratio: float = 0.8  # definition: max. distance of the best match, in that of the second best: Lowe's
     unit: float = 512.0  # definition: COLMAP's bytes of a descriptor of length 1
     coarse: int = 256  # limit: features that are compared first, in squared time: photos share 20 to 120, or 5
     few: int = 30  # limit: photos of which all pairs are compared, 10 to 20 s of one core; a third more takes double
@@ -45,7 +45,7 @@ class VideoNumbers:
     # chosen: pixels of the longer side where corners are followed; at a third fewer, blur shows a tenth less
     small: int = 480
     corners: int = 200  # limit: corners that are followed; a third fewer or more measure a tenth less or more motion
-    least_corners: int = 3  # limit: corners that are found again, at least, to measure a motion
+    least_corners: int = 3  # limit: min. corners that are found again, to measure a motion
     least_followed: float = 0.5  # chosen: share of the corners that are still followed, below which new ones are found
     window: int = 21  # definition: pixels of OpenCV's window around a corner
     levels: int = 4  # limit: halvings of the picture: motion of up to 160 pixels of `small`
@@ -60,7 +60,7 @@ class WorldNumbers:
     flat: float = 0.02  # chosen: ratio of spreads below which points are on one line, or in one plane
     mirrored: float = 0.5  # chosen: residual of the best reflection, relative to the best similarity
     trials: int = 300  # limit: random triples of points
-    outlier: float = 3.0  # chosen: residual of an inlier, in that which half of the points do not exceed, at most
+    outlier: float = 3.0  # chosen: max. residual of an inlier, in that which half of the points do not exceed
     rounding: float = 1e-9  # limit: residual, as a share of the spread of the points, that counts as 0
 
 
@@ -68,9 +68,9 @@ class WorldNumbers:
 class TableNumbers:
     """A turntable from photos of a board on it, and how sure focal lengths are."""
 
-    least_photos: int = 4  # chosen: photos of a camera that show the board, at least
-    least_corners: int = 6  # limit: corners of the board in each of them, at least
-    least_turn: float = 10.0  # chosen: degrees of all photos together, at least
+    least_photos: int = 4  # chosen: min. photos of a camera that show the board
+    least_corners: int = 6  # limit: min. corners of the board in each of them
+    least_turn: float = 10.0  # chosen: min. degrees of all photos together
     flat: float = 0.7  # chosen: cosine between the axis and the normal of a board that lies, more or less
     most_residual: float = 0.005  # chosen: residual in widths of the photo, above which more than the table has moved
     rough: float = 1e-3  # limit: relative change of squared residuals at which the first search ends
@@ -81,7 +81,6 @@ class TableNumbers:
     apart: float = 3.0  # chosen: spread of focal lengths of single photos, in their deviation, above which they differ
     most_sd: float = 0.01  # chosen: standard deviation of a focal length, as a share of it; more shows in heights
     off_middle: float = 0.01  # chosen: sd of principal points of phones, cameras and webcams, in longer sides
-
 
 
 STRUCTURE = StructureNumbers()

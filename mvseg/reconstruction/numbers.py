@@ -15,7 +15,7 @@ class RayNumbers:
     """Directions of cameras, and points where rays meet."""
 
     most_error: float = 0.003  # chosen: miss of a point, in widths of the photo, from which a view is left out
-    least_angle: float = math.radians(1.0)  # chosen: angle between two rays that make a point, at least
+    least_angle: float = math.radians(1.0)  # chosen: min. angle between two rays that make a point
     same: float = math.radians(1.0)  # limit: angle between directions below which they crowd each other no more
     parallel: float = math.radians(2.0)  # chosen: RMS of axes' angles to their mean, where they meet in no point
     tie: float = 1e-6  # limit: difference of equal sums, as a share; the first one is taken
@@ -73,7 +73,7 @@ class StartNumbers:
     bent: float = 1.35  # chosen: or of the way along it to the straight one: graphs make detours of a tenth
     turns_deg: tuple[float, ...] = (0.0, 90.0, 45.0, 135.0)  # chosen: angles about the midrib of the starts' sides
     # Masks of a pixel have flat hulls, or hulls of a few voxels.
-    thinnest: float = 0.01  # limit: width of a start in its lengths, and length in deviations of the cloud, at least
+    thinnest: float = 0.01  # limit: min. width of a start in its lengths, and length in deviations of the cloud
     tie: float = 1e-6  # limit: difference of equal lengths or distances, by rounding; the first one is taken
     flat: float = 1e-3  # chosen: part of a direction out of the cameras' plane, up to which a leaf lies in it
 
@@ -117,16 +117,16 @@ class FitNumbers:
     offset_from: int = 6  # chosen: step from which masks may be too large or small
     offset_share: float = 0.8  # chosen: share of a measured offset that is believed
     clean_px: float = 1.0  # chosen: deviation of distances of clean masks; above, fold and curl stay near none
-    narrow: float = 0.15  # chosen: width of half a leaf that limits steps, as a share of its length, at least
+    narrow: float = 0.15  # chosen: min. width of half a leaf that limits steps, as a share of its length
     noisy_view: float = 1.5  # chosen: deviation of a view's distances from which it counts less, in the usual one
     sd_factor: float = 2.0  # chosen: factor of deviations
     difference: float = 1e-4  # limit: move of a coefficient for a derivative, as a share of the spread of all
-    usual_px: float = 0.3  # chosen: median distance of the usual view of a leaf, at least
+    usual_px: float = 0.3  # chosen: min. median distance of the usual view of a leaf
     sd_of_median: float = 1.48  # definition: standard deviation of normal errors, in median absolute ones
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     # Where masks are clean, little is measured.
     centre_factor: float = 1.5  # chosen: sd of the common offset of all masks, in the measured one
-    least_free: float = 0.5  # chosen: views beyond two, at least: with two, the offset of all masks is hardly known
+    least_free: float = 0.5  # chosen: min. views beyond two: with two, the offset of all masks is hardly known
     least_centre_sd: float = 0.1  # chosen: the same in pixels, at least
     # Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15.
     least_eigenvalue: float = 1e-10  # limit: least eigenvalue of a scaled normal matrix that is not singular
@@ -139,7 +139,7 @@ class ImageNumbers:
     supersampled: int = 3  # limit: small pixels along each side of a pixel that is drawn
     drawn_too_far: float = 0.48  # definition: pixels by which OpenCV widens polygons (test_outline.py)
     sub_pixel_bits: int = 4  # limit: corners of OpenCV's polygons are whole numbers of 1 / 2^4 pixels
-    least_growth_px: float = 0.15  # limit: offset with which a patch is drawn, at least: less is not worth the time
+    least_growth_px: float = 0.15  # limit: min. offset with which a patch is drawn: less is not worth the time
     drawn_beside: int = 4  # limit: pixels that the blurred image of a patch reaches beyond it
     near_px: int = 6  # chosen: distance from a leaf in which it matters what lies in front
 
@@ -153,9 +153,9 @@ class OutlineNumbers:
     outside_px: float = 1.6  # chosen: distance from a sample on the outline of a pixel that the patch does not cover
     reverse_weight: float = 0.5  # chosen: weight of samples of the masks' edges, where that of the patch's is 1
     pull_from_px: float = 4.0  # chosen: distance outside of the patch from which an edge pulls at its nearest sample
-    similar: float = 0.5  # chosen: cosine between the normals of two samples that match, at least
+    similar: float = 0.5  # chosen: min. cosine between the normals of two samples that match
     near_steps: int = 3  # limit: steps of a pixel to either side where an edge is looked for first: most are there
-    most_shift_px: float = 5.0  # chosen: distance between the outline of a patch and the edge of its image, at most
+    most_shift_px: float = 5.0  # chosen: max. distance between the outline of a patch and the edge of its image
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ class SearchNumbers:
     few_masks: int = 60  # limit: masks below which they are fitted in this process: others would take longer to start
     at_once: int = 8  # limit: instances whose starts are searched side by side
     searched_views: int = 12  # limit: views of a leaf in which starts are compared, evenly spread
-    most_starts: int = 3  # limit: starts of each hull that are tried, at most
+    most_starts: int = 3  # limit: max. starts of each hull that are tried
     most_fits: int = 3  # limit: starts that are fitted, but for rough fits
     clear_iou: float = 0.75  # chosen: median IoU of the likely start from which a rough fit tries no other one
     least_gain: float = 0.03  # chosen: IoU by which another start must be better, for a rough fit to take it
@@ -204,11 +204,11 @@ class ErrorNumbers:
     """How the masks of a segmenter err."""
 
     rounds: int = 4  # limit: times that the offsets and their density are found in turn
-    least_masks: int = 20  # limit: masks from which errors are learnt, at least
+    least_masks: int = 20  # limit: min. masks from which errors are learnt
     least_spread_px: float = 0.3  # chosen: deviation of their sizes below which they are clean
     measured_px: float = 0.2  # chosen: standard deviation of the measured offset of one mask
     step_px: float = 0.05  # limit: steps at which a density is given
-    floor: float = 1e-3  # limit: density per pixel, at least: any mask may be wrong in another way
+    floor: float = 1e-3  # limit: min. density per pixel: any mask may be wrong in another way
 
 
 @dataclass(frozen=True)
@@ -241,13 +241,13 @@ class TubeNumbers:
     end_weight: float = 4.0  # chosen: weight of an end, in that of a sample of a side: there is one of it
     shorten: float = 0.25  # chosen: weight of a mask that ends before the tube, where that of a longer one is 1
     damping: float = 0.01  # limit: of a step, as a share of the diagonal
-    most_step: float = 0.1  # limit: way of a coefficient in a step, at most, in lengths of the tube
-    least_radius: float = 0.05  # limit: radius after a step, at least, in the mean one before it
+    most_step: float = 0.1  # limit: max. way of a coefficient in a step, in lengths of the tube
+    least_radius: float = 0.05  # limit: min. radius after a step, in the mean one before it
     bend_sd: float = 0.03  # chosen: deviation of third differences of the axis, in lengths
     speed_sd: float = 0.05  # chosen: deviation of the speed along a piece of the axis, in lengths
     taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
     sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
-    usual_px: float = 0.3  # chosen: median distance of the usual view of a leaf, at least
+    usual_px: float = 0.3  # chosen: min. median distance of the usual view of a leaf
     sd_of_median: float = 1.48  # definition: standard deviation of normal errors, in median absolute ones
     quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
@@ -268,15 +268,15 @@ class AxisNumbers:
     bent_leaves: int = 5  # chosen: leaves from which the axis may bend
     begins: float = 0.15  # chosen: share of the midrib that tells in which direction it begins
     lever: float = 0.2  # chosen: share of the midrib where the azimuth of a leaf is measured
-    longest_petiole: float = 0.8  # chosen: length of a petiole, at most
+    longest_petiole: float = 0.8  # chosen: max. length of a petiole
     petiole_cost: float = 0.05  # chosen: distance from the axis that a longer petiole is worth, in its length
     least_petiole: float = 0.01  # limit: length of a petiole below which the axis may not go on along its ray
     to_bases: float = 0.05  # chosen: weight of the distance of the axis along a ray, where that beside it is 1
     petiole_square: float = 0.1  # chosen: weight of squared lengths of petioles against distances of their rays
     arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (of a petiole's chord to its end at the blade)
     near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
-    near_share: float = 0.6  # chosen: share of the leaves that are nearer than this, at least
-    least_extent: float = 2.5  # chosen: distance between the outer nodes, in median petioles or misses, at least
+    near_share: float = 0.6  # chosen: min. share of the leaves that are nearer than this
+    least_extent: float = 2.5  # chosen: min. distance between the outer nodes, in median petioles or misses
     least_miss: float = 0.05  # chosen: what counts as a petiole or a miss, at least
     lean_cost: float = 1.0  # chosen: cost of a level axis per leaf, where that of a leaf that misses it is 1
     tilt_cost: float = 0.02  # chosen: weight against a tilt in a round, where that of a leaf is 1
@@ -292,7 +292,7 @@ class AxisNumbers:
 class ThinNumbers:
     """Thin parts in photos, cells of space that show them, and the path through them."""
 
-    longest_px: int = 500  # chosen: longer side of the part of a photo with the plant, at most
+    longest_px: int = 500  # chosen: max. longer side of the part of a photo with the plant
     margin: float = 0.25  # chosen: what is looked at around the plant, as a share of its image
     beside_px: int = 2  # chosen: distance from a mask within which a leaf may still hide something
     around_px: int = 15  # chosen: distance to what is around a thin part: it is less wide than this
@@ -302,21 +302,21 @@ class ThinNumbers:
     beyond: float = 0.15  # chosen: how far cells reach beyond the leaves, in the extent of these
     coarse_cells: int = 32  # limit: cells along the plant, at first
     levels: int = 3  # limit: times that cells are looked at; they are halved in between
-    least_share: float = 0.7  # chosen: mean share of the views that show a cell as thin, at least
-    least_views: int = 3  # limit: views that see a cell, at least
+    least_share: float = 0.7  # chosen: min. mean share of the views that show a cell as thin
+    least_views: int = 3  # limit: min. views that see a cell
     view_share: float = 0.35  # chosen: the same as a share of all views
     around_cells: int = 17  # chosen: side of the cube in which a part is thin or thick, in cells
-    most_filled: float = 0.2  # chosen: share of this cube that shows a thin part, at most
+    most_filled: float = 0.2  # chosen: max. share of this cube that shows a thin part
     most_cells: int = 20_000  # limit: cells through which a path is looked for
     gap_cells: float = 2.0  # limit: longest step between all cells, in cells
     bridge_cells: float = 16.0  # chosen: longest step between some of the cells, across what leaves hide, in cells
     cube_cells: float = 3.0  # limit: side of the cubes of which one cell each has such steps, in cells
     gap_power: float = 1.5  # chosen: exponent of the cost of a step's length
     doubt_cost: float = 4.0  # chosen: cost of a cell that no view shows, in that of a sure one
-    touch_cells: float = 8.0  # chosen: distance between a leaf and the cell where its petiole ends, at most
+    touch_cells: float = 8.0  # chosen: max. distance between a leaf and the cell where its petiole ends
     touch_cost: float = 30.0  # chosen: cost of entering or leaving a leaf: paths do not run through leaves
-    least_leaves: int = 3  # limit: leaves that are joined, at least
-    least_steps: int = 6  # chosen: cells of a line, at least
+    least_leaves: int = 3  # limit: min. leaves that are joined
+    least_steps: int = 6  # chosen: min. cells of a line
     line_ends: int = 60  # limit: cells of which any two are tried as points of the line of a stem
     line_cells: float = 2.0  # chosen: distance from the line that has half the weight of none, in cells
     line_rounds: int = 6  # limit: rounds of fitting the line

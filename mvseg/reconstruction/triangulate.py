@@ -15,7 +15,6 @@ Floats = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
 
 
-
 def triangulate_points(cameras: Cameras, sightings: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
     """Points that two views or more agree on.
 

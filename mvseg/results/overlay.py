@@ -11,9 +11,9 @@ import numpy as np
 from mvseg.masks import SURE, Masks
 from mvseg.results.scale_bar import ScaleBar
 
-MAX_SIDE = 1600  # limit: pixels of an overlay's longer side, at most
+MAX_SIDE = 1600  # limit: max. pixels of an overlay's longer side
 MARGIN = 0.06  # limit: margin around the plant in a picture, as a share of its longer side
-LEAST_SHARE = 0.05  # limit: width of a picture as a share of the photo's, at least: a photo has no more detail
+LEAST_SHARE = 0.05  # limit: min. width of a picture as a share of the photo's: a photo has no more detail
 UNMATCHED = (150, 150, 150)  # chosen: RGB of masks without an instance
 CAPITAL = 26  # limit: pixels of the height of OpenCV's digits at scale 1
 

@@ -26,7 +26,7 @@ from mvseg.traits.table import write_long, write_nodes, write_wide
 from mvseg.traits.up import level_frame
 
 NODES_FILE = "nodes.csv"
-MAX_FACES = 4000  # limit: triangles of a leaf in scene.glb, at most; its own file has all of them
+MAX_FACES = 4000  # limit: max. triangles of a leaf in scene.glb; its own file has all of them
 METRES = {
     "m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6,
     **{f"{prefix}met{end}": power for prefix, power in (("", 1.0), ("centi", 1e-2), ("milli", 1e-3))

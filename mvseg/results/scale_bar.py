@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mvseg.reconstruction.voxels import VoxelGrid
 
 STEPS = (1, 2, 5)  # definition: round lengths, times powers of ten
-MOST = 0.2  # definition: length of a bar, as a share of the photo's width, at most
+MOST = 0.2  # definition: max. length of a bar, as a share of the photo's width
 
 
 @dataclass(frozen=True)

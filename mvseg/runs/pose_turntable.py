@@ -154,7 +154,7 @@ def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) ->
 def _angles_of(
     names: Sequence[str],
     camera_of: Sequence[str],
-    known: Sequence[tuple[str, float]],
+    angles_of: Sequence[tuple[str, float]],
     *,
     angles: Angles,
     turntable: Path,
@@ -171,7 +171,7 @@ def _angles_of(
     if angles is not None:
         return [angles * place for place in places]
     counts = Counter(camera_of)
-    of_camera = {camera: [angle for name, angle in known if name == camera] for camera in counts}
+    of_camera = {camera: [angle for name, angle in angles_of if name == camera] for camera in counts}
     for camera, count in counts.items():
         if count != (num_views := len(of_camera[camera])):
             of = f" of camera {camera}" if len(counts) > 1 else ""

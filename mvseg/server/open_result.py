@@ -130,7 +130,7 @@ class OpenResult:
 
     def page(self, corrections: Corrections) -> str:
         """The page with the newest result, and with all edits."""
-        shown, pictures = self._shown
+        shown, pictures = self._page_result
         shown = replace(shown, corrections=corrections)
         return build_page(shown, pictures, run=self.run.record.as_json(), is_served=True)
 
@@ -143,21 +143,21 @@ class OpenResult:
         sizes = result.scene.cameras.sizes.tolist()
         pictures = [
             picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
-            for view, picture in enumerate(self._shown[1])
+            for view, picture in enumerate(self._page_result[1])
         ]
-        before = self._shown[0]
+        before = self._page_result[0]
         known = () if before.corrections is None else before.corrections.edits
         new = [each for each in corrections.edits if each not in known]
         vanished = tell_vanished(before, result, new=new)
         news = describe_update(result, pictures)
         news["told"] = tell_drawn(result, new=new, angles=measure_angles(result))
-        self._shown = result, pictures
+        self._page_result = result, pictures
         yield Update(news, outcomes, vanished + messages)
         if self.opened.is_chosen:
             self._now[0].draw_ahead()
 
     @cached_property
-    def _shown(self) -> tuple[Result, list[Picture]]:
+    def _page_result(self) -> tuple[Result, list[Picture]]:
         """The newest result, and a picture of each view; at first, what lies in the folder."""
         masks, views = self._saved.masks, range(len(self.scene.views))
         return self._saved, [draw_picture(self.photos(view), masks, view=view, is_whole=True) for view in views]
@@ -200,7 +200,7 @@ class OpenResult:
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(plant, corrections)
             result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
-        shown = keep_numbers(replace(result, corrections=corrections), self._numbers, self._shown[0].masks)
+        shown = keep_numbers(replace(result, corrections=corrections), self._numbers, self._page_result[0].masks)
         told = {"edit", *(each.get("code") for each in self.run.record.findings)}
         new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]
@@ -219,7 +219,8 @@ class OpenResult:
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
         with running(is_cancelled=is_old, report=report), collect_warnings() as findings, TemporaryDirectory() as place:
-            learned = learn(self._found[0], cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
+            cache = CachedDetections(Path(place))
+            learned = learn(self._plant_before[0], cache=cache, corrections=corrections, rounds=1)
         if learned.learned.weights is None:
             raise InputError(" ".join(map(as_sentence, findings)))
         self.learned = learned, findings
@@ -270,10 +271,10 @@ class OpenResult:
 
     @property
     def _now(self) -> tuple[Plant, list[Finding]]:
-        return self._found if self.learned is None else self.learned
+        return self._plant_before if self.learned is None else self.learned
 
     @cached_property
-    def _found(self) -> tuple[Plant, list[Finding]]:
+    def _plant_before(self) -> tuple[Plant, list[Finding]]:
         """The plant before edits, and the findings on the way; found once."""
         before = None if (content := self._before_edits()) is None else unpack_plant(content, self.opened)
         if before is not None:

@@ -54,7 +54,7 @@ class OpenTracks:
         self.recorded = read_recorded_tracks(folder)
         self.plant = _choose_plant(self.recorded, plant)
         self.dates = self.plant.read(pictures=PAGE.large_side)
-        self._shown = self._track(self._links(self.read_edits()[0])[0])
+        self._page = self._track(self._links(self.read_edits()[0])[0])
 
     def read_edits(self) -> tuple[Corrections, str]:
         """The edits in the folder, or else those that the tracks were made with."""
@@ -74,7 +74,7 @@ class OpenTracks:
             "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
             "revision": name_edits(corrections.edits),
         }  # fmt: skip
-        return build_tracks_page(self.plant.plant, self._shown.data | {"correct": correct})
+        return build_tracks_page(self.plant.plant, self._page.data | {"correct": correct})
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         """The tracks with these edits; then, what the answers to each question would change.
@@ -84,7 +84,7 @@ class OpenTracks:
             InputError: see `track_leaves`.
         """
         links, outcomes = self._links(corrections)
-        self._shown = page = self._track(links)
+        self._page = page = self._track(links)
         yield Update(_without_pictures(page.data), outcomes, [])
         questions = []
         for question in list_questions(page.tracks, links):
@@ -119,8 +119,8 @@ class OpenTracks:
     def _changes(self, question: Question, links: Sequence[LeafLink]) -> list[str]:
         """Differences of the tracks if they are wrong there."""
         with suppress(InputError):  # it contradicts what was said before
-            other = question.link(self._shown.tracks, is_same=not question.is_linked)
-            return describe_changes(self._shown.tracks, self._track_with([*links, other]))
+            other = question.link(self._page.tracks, is_same=not question.is_linked)
+            return describe_changes(self._page.tracks, self._track_with([*links, other]))
         return []
 
 

@@ -11,7 +11,7 @@ CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u206
 
 def plain(text: str) -> str:
     r"""The text with each control character as its escape: "\x1b" for the one that begins a terminal's commands."""
-    return CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+    return CONTROL.sub(lambda match: match[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def say(text: object = "", *, to_stderr: bool = False, end: str = "\n") -> None:

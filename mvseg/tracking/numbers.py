@@ -16,7 +16,7 @@ class ObservationNumbers:
 
     stations: int = 9  # definition: points of a midrib, base and tip included
     rows: int = 12  # definition: rows of points from base to tip, of edge, midrib and edge
-    most_parts: int = 256  # limit: parts of a path, at most
+    most_parts: int = 256  # limit: max. parts of a path
     most_days: int = 100_000  # limit: days of five digits; more are dates, or seconds
 
     @property
@@ -31,7 +31,7 @@ class AlignNumbers:
 
     still: float = 5 / 6  # chosen: probability that a pot stands as it stood, before its plant is known
     prior_pairs: int = 6  # chosen: pairs of dates that say as much as this does
-    least_still: float = 1e-6  # limit: probability of either answer, at least, so that its logarithm is a number
+    least_still: float = 1e-6  # limit: min. probability of either answer, so that its logarithm is a number
     num_refined: int = 20  # chosen: poses of two dates that are refined, those that look best
     upright: float = 2.0  # chosen: weight of the direction of up where a pose is fitted, in leaves
     tip: float = 0.43  # chosen: weight of the tip of a leaf there, where base and middle have 1, for tips sway
@@ -40,8 +40,8 @@ class AlignNumbers:
     temper: float = 0.44  # fitted: python benchmarks/fit_chances.py; share of a gain of a pose that is log odds
     told: float = 0.9  # chosen: probability of an alignment below which the user is told
     turns: int = 30  # definition: turns of a pot that leaves can tell apart, of 12 degrees
-    rounds: int = 5  # limit: rounds of pairing leaves and fitting a pose to them, at most
-    date_rounds: int = 6  # limit: rounds of placing all dates anew, at most; two or three are enough
+    rounds: int = 5  # limit: max. rounds of pairing leaves and fitting a pose to them
+    date_rounds: int = 6  # limit: max. rounds of placing all dates anew; two or three are enough
     digits: int = 6  # limit: decimals of logarithms and probabilities; what differs in later ones is a tie
     places: int = 9  # limit: decimals of a pose; what differs in later ones is rounding
 
@@ -73,8 +73,8 @@ class LinkNumbers:
     unlinked: float = 2.0  # chosen: a pair of leaves that costs less favours one track over two
     user_odds: float = 20.0  # definition: log odds of a user's link for weighing poses: more than any leaf's
     asked: float = 1e4  # limit: gain of a link of the user, above all that leaves can say
-    most_odds: float = 40.0  # limit: log odds, at most, so that their exponentials are numbers
-    rounds: int = 10  # limit: rounds of joining anew, at most; two or three are enough
+    most_odds: float = 40.0  # limit: max. log odds, so that their exponentials are numbers
+    rounds: int = 10  # limit: max. rounds of joining anew; two or three are enough
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class GrowthNumbers:
     before: float = 5.0  # limit: the same
     first_rate: float = 4.0  # limit: rate that the search begins with, in 1 / span
     middles: tuple[float, float] = (-0.5, 0.2)  # limit: days of half growth that it begins with, in spans
-    least_growth: float = 0.02  # limit: growth of a curve that begins the search, over the largest size, at least
+    least_growth: float = 0.02  # limit: min. growth of a curve that begins the search, over the largest size
     most_condition: float = 1e14  # limit: condition number of an information matrix that is inverted
     least_dates: int = 5  # chosen: min. dates on which a leaf is measured for a curve, which has three parameters
 

@@ -211,9 +211,7 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.
     return tuple(sorted(rows, key=lambda row: (row.date, row.track)))
 
 
-def _rank_tracks(
-    rows: Sequence[TrackRow], dates: Sequence[PlantOnDate], compared: Comparison
-) -> tuple[TrackRow, ...]:
+def _rank_tracks(rows: Sequence[TrackRow], dates: Sequence[PlantOnDate], compared: Comparison) -> tuple[TrackRow, ...]:
     """Number the tracks from below, see `TrackRow.track`."""
     bases = {(n, leaf.leaf): leaf.midrib for n, date in enumerate(dates) for leaf in date.leaves if date.knows_up}
     heights: dict[int, list[float]] = {row.track: [] for row in rows}

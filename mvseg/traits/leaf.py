@@ -41,7 +41,7 @@ class Measurement:
         return bool(np.isfinite(self.value))
 
     def __format__(self, spec: str) -> str:
-        """"315 +- 8": the value by a format specification, and as many of its digits of the deviation."""
+        """ "315 +- 8": the value by a format specification, and as many of its digits of the deviation."""
         if not np.isfinite(self.sd):
             return format(self.value, spec)
         return f"{self.value:{spec}} +- {self.sd:.{1 if self.sd >= 1 else 2}g}"

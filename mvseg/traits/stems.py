@@ -35,11 +35,11 @@ Floats = NDArray[np.float64]
 MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
 LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
 MOST_GAP = 8.5  # chosen: longest step in a petiole that was traced, in cells
-SUPPORTED = 0.5  # chosen: share of the views that show the axis of leaf bases as thin, at least, where photos exist
-LEAF_SHARE = 0.5  # chosen: leaves that sit on a path, of all, at least
+SUPPORTED = 0.5  # chosen: min. share of the views that show the axis of leaf bases as thin, where photos exist
+LEAF_SHARE = 0.5  # chosen: min. leaves that sit on a path, of all
 UPRIGHT = 0.3  # chosen: length of the mean of the directions that are up in the photos, for them to agree
 FAINTEST = 0.25  # chosen: part of an axis that views need not show
-LEAST_SEEN = 0.3  # chosen: part of an axis that enough views see, at least
+LEAST_SEEN = 0.3  # chosen: min. part of an axis that enough views see
 LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter ones of seedlings lean by 20 degrees
 
 
@@ -149,9 +149,7 @@ class SeenPlant:
         return float(np.quantile(shares[is_seen], FAINTEST)) if is_seen.mean() > LEAST_SEEN else 0.0
 
 
-def see_plant(
-    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
-) -> SeenPlant:
+def see_plant(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos) -> SeenPlant:
     """Look for thin parts around the leaves, in some of the photos."""
     leaves = {leaf: surface.points(*LEAF_GRID).reshape(-1, 3).numpy() for leaf, surface in surfaces.items()}
     points = np.concatenate(list(leaves.values()))

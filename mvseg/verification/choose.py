@@ -118,9 +118,7 @@ def choose_leaves(
     tables += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
     is_edited = removed is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
     has_shapes = _is_surrounded(more[0].to("cpu") if is_edited else matched, cameras)
-    candidates = gather_candidates(
-        tables, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache
-    )
+    candidates = gather_candidates(tables, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache)
     views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
     is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
     for each in views:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 class EvidenceNumbers:
     """Evidence of surfaces for masks."""
 
-    most_px: int = 800  # limit: longer side of the photos on which masks are compared, at most
+    most_px: int = 800  # limit: max. longer side of the photos on which masks are compared
     fits: float = 0.5  # definition: a mask shows a leaf if its IoU with the visible part of the leaf is larger
-    open_pixels: int = 100  # chosen: unhidden pixels of a surface that a view sees openly, at least
+    open_pixels: int = 100  # chosen: min. unhidden pixels of a surface that a view sees openly
     shared: float = 0.5  # definition: fraction of the smaller of two masks that is in both, where they show one leaf
 
 
@@ -23,15 +23,15 @@ class EvidenceNumbers:
 class RoughNumbers:
     """Surfaces that judge masks before ids are final."""
 
-    views: int = 12  # limit: views of an instance that a rough surface is fitted to, at most
-    least_parallax: float = 30.0  # chosen: degrees between the directions that most instances are seen from, at least
+    views: int = 12  # limit: max. views of an instance that a rough surface is fitted to
+    least_parallax: float = 30.0  # chosen: min. degrees between the directions that most instances are seen from
 
 
 @dataclass(frozen=True)
 class PartNumbers:
     """Masks that show two leaves."""
 
-    least_each: float = 0.2  # chosen: fraction of a mask that each of the two leaves it shows covers, at least
+    least_each: float = 0.2  # chosen: min. fraction of a mask that each of the two leaves it shows covers
     least_both: float = 0.7  # chosen: and both together
 
 
@@ -55,7 +55,7 @@ class ChoiceNumbers:
     some: float = 0.1  # definition: number of masks that is added before the logarithm, a feature of P
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
     least_q: float = 0.2  # chosen: q from which a mask may show a leaf
-    least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
+    least_views: int = 2  # definition: min. views in which a leaf has masks; one view alone is no agreement
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
 
 
@@ -64,12 +64,12 @@ class DrawnNumbers:
     """Search for leaves that the user drew, in other views."""
 
     least_visible: float = 0.3  # chosen: unhidden fraction of a surface that a view sees openly; see `open_pixels`
-    least_colored: float = 0.8  # chosen: fraction of the unhidden part that has the colour of leaves, at least
+    least_colored: float = 0.8  # chosen: min. fraction of the unhidden part that has the colour of leaves
     half: float = 0.5  # definition: a mask shows half a leaf if it covers less of the surface's image
     rounds: int = 2  # limit: fits: the second one is to what is found where the surface of the first one is
-    beside_px: int = 2  # chosen: pixels between leaf colour and where a view may show a leaf, at most
+    beside_px: int = 2  # chosen: max. pixels between leaf colour and where a view may show a leaf
     most_against: float = 0.15  # chosen: fraction of views with another colour at a point: stakes hide leaves
-    reach: float = 0.1  # chosen: reach of a leaf beyond its first surface, in roots of the surface's area, at most
+    reach: float = 0.1  # chosen: max. reach of a leaf beyond its first surface, in roots of the surface's area
 
 
 @dataclass(frozen=True)

@@ -91,14 +91,14 @@ def test_a_leaf_of_few_views_is_asked_about_once() -> None:
     few = [each for each in doubts(masks_of(maps)) if each.kind == "few"]
     whole = [int(mask.sum()) for mask in LEAVES[3].project(CAMERAS)]
     openly = sum((labels == 3).sum() >= 0.5 * size for labels, size in zip(TRUE, whole, strict=True))
-    assert [(each.instance, each.view, each.found, each.expected) for each in few] == [(3, 0, 1, openly)]
+    assert [(each.instance, each.view, each.num_found, each.num_expected) for each in few] == [(3, 0, 1, openly)]
     assert few[0].doubt == pytest.approx(1 - 1 / openly)
 
 
 def test_without_surfaces_every_view_should_show_a_leaf() -> None:
     maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
     found = list_mask_questions(masks_of(maps), None, cameras=CAMERAS)
-    assert [(each.kind, each.instance, each.found, each.expected) for each in found] == [("few", 3, 2, 6)]
+    assert [(each.kind, each.instance, each.num_found, each.num_expected) for each in found] == [("few", 3, 2, 6)]
 
 
 def test_the_mask_that_its_surface_explains_worst_is_asked_about() -> None:
@@ -213,7 +213,7 @@ def test_half_masks_of_a_leaf_are_one_question() -> None:
     views = tuple(view for view, labels in enumerate(TRUE) if (labels == 2).sum() > 0.5 * (TRUE[0] == 2).sum())
     found = list_mask_questions(halved(views), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
     half = [each for each in found if each.kind == "half"]
-    assert [(each.instance, each.found >= 3) for each in half] == [(2, True)]
+    assert [(each.instance, each.num_found >= 3) for each in half] == [(2, True)]
     assert found[0] is half[0]
     assert {view for view, _ in half[0].outlines} <= {*views}
     few = list_mask_questions(halved(views[:2]), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)

@@ -145,9 +145,7 @@ def test_looks_that_are_thrown_away_are_not_spoken_of(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize(("is_cropped", "near"), [(False, False), (True, False), (False, True)])
-def test_a_part_of_many_photos_chooses_the_size(
-    monkeypatch: pytest.MonkeyPatch, is_cropped: bool, near: bool
-) -> None:
+def test_a_part_of_many_photos_chooses_the_size(monkeypatch: pytest.MonkeyPatch, is_cropped: bool, near: bool) -> None:
     """All of them are seen once, at the size that won, in boxes of their own; or twice, where two are nearly equal."""
     asked: list[tuple[int, int | None, int | None]] = []
 

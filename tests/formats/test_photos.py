@@ -203,9 +203,7 @@ def test_photos_for_a_detector_and_photos_that_are_missing(tmp_path: Path) -> No
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "late.png", "tif", "deep.tif", "webp"])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(
-    tmp_path: Path, orientation: int, suffix: str
-) -> None:
+def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(tmp_path: Path, orientation: int, suffix: str) -> None:
     """As COLMAP reads them, in every format."""
     folder = write_scene(tmp_path / "plant")
     rig = folder / "cameras.json"

@@ -191,9 +191,7 @@ MASK = np.zeros((HEIGHT, WIDTH), bool)
 MASK[2:8, 3:9] = True
 RUNS = {"size": [HEIGHT, WIDTH], "counts": [38, 6, 6, 6, WIDTH * HEIGHT - 56]}
 SEGMENTATIONS = [[[1.0, 1, 9, 1, 9, 9]], encode_mask(MASK), RUNS]
-IMAGES = [
-    {"id": view, "file_name": f"{name}.png", "width": WIDTH, "height": HEIGHT} for view, name in enumerate(NAMES)
-]
+IMAGES = [{"id": view, "file_name": f"{name}.png", "width": WIDTH, "height": HEIGHT} for view, name in enumerate(NAMES)]
 COCO: dict[str, Any] = {
     "images": IMAGES,
     "categories": [{"id": 4, "name": "leaf"}],

@@ -57,9 +57,7 @@ def test_the_next_step_is_a_command(result: Result) -> None:
     assert steps["leaves_missed"].endswith(": mvseg infer --again 'my out' --learn 2")
 
 
-@pytest.mark.parametrize(
-    "learned", [Learned(rounds=1, agreed_area=(3.0, 9.0)), Learned(agreed_area=(3.0, 3.1)), None]
-)
+@pytest.mark.parametrize("learned", [Learned(rounds=1, agreed_area=(3.0, 9.0)), Learned(agreed_area=(3.0, 3.1)), None])
 def test_learning_is_not_advised_right_after_it(learned: Learned | None, result: Result) -> None:
     findings = (MISSED, *(() if learned else (Finding("learned_too_few", values={"count": 1, "least": 3}),)))
     after = replace(result, findings=findings, learned=learned or Learned(agreed_area=(3.0,)))

@@ -263,9 +263,7 @@ def move_mask(path: Path) -> None:
     ("name", "change"),
     [("surfaces.npz", write_other_surfaces), ("traits_wide.csv", drop_last_row), ("instances.json", move_mask)],
 )
-def test_files_that_run_json_does_not_list_are_refused(
-    saved: Path, name: str, change: Callable[[Path], None]
-) -> None:
+def test_files_that_run_json_does_not_list_are_refused(saved: Path, name: str, change: Callable[[Path], None]) -> None:
     """Each of them can be read: of another result, or cut between two rows."""
     change(saved / name)
     with pytest.raises(InputError, match=f"{name}: is not the file that run.json lists: changed since, or another"):

@@ -159,9 +159,7 @@ def test_deviations_are_those_of_samples(monkeypatch: pytest.MonkeyPatch) -> Non
     numbers = measure_leaf(surface, FRAME)
     rng, drawn = np.random.default_rng(0), []
     center = surface.coefficients.numpy()
-    monkeypatch.setattr(
-        LeafSurface, "deviation", lambda self, measure: measure(self.coefficients.numpy()[None])[0]
-    )
+    monkeypatch.setattr(LeafSurface, "deviation", lambda self, measure: measure(self.coefficients.numpy()[None])[0])
     for _ in range(500):
         drawn.append(measure(replace(surface, coefficients=torch.from_numpy(center + rng.normal(0, sd, center.shape)))))
     for name in ("area", "width", "inclination", "base_inclination", "azimuth", "insertion_height", "fold_angle"):

@@ -167,7 +167,12 @@ def test_masks_of_stems_tell_better_than_leaves() -> None:
         leaves[number] = move(bent_blade(), turn_about(UP, azimuth), scale=0.01, shift=tuple(BENT[place] + out))
     regions = regions_from_label_maps([np.zeros((SIZE, SIZE), np.int64)] * len(cameras))
     (stem,) = find_stems(
-        leaves, Masks.of(regions), cameras, frame=level_frame(UP), photos=NoPhotos(), tubes=[tube.reverse()]  # type: ignore[arg-type]
+        leaves,
+        Masks.of(regions),
+        cameras,
+        frame=level_frame(UP),
+        photos=NoPhotos(),
+        tubes=[tube.reverse()],  # type: ignore[arg-type]
     )
     assert stem.source == "masks"
     assert [node.leaf for node in stem.nodes] == [1, 2, 3]

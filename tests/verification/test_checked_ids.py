@@ -186,7 +186,7 @@ def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(s
 def test_a_mask_that_the_user_keeps_apart_from_a_leaf_does_not_return_to_it(
     is_linked: bool, scene: tuple[Regions, Tensor]
 ) -> None:
-    """"different": the matcher then matches it to nothing, but its leaf's surface is where it is."""
+    """ "different": the matcher then matches it to nothing, but its leaf's surface is where it is."""
     regions, ids = scene
     wrong, row = ids.clone(), place_of(regions, ids, 4, 2)
     wrong[row] = -1

@@ -102,4 +102,3 @@ def test_columns_are_instance_ids() -> None:
     np.testing.assert_array_equal(both.visible[:, [4, 2]], expected.visible)
     np.testing.assert_array_equal(both.share[:, [4, 2]], expected.share)
     assert not both.inside[:, [0, 1, 3, 5, 6]].any()
-

@@ -156,9 +156,7 @@ def as_tube(points: Floats, distances: Floats) -> Tube:
     return Tube(fit_axis(points), np.zeros(RADIUS), covariance, views, nothing, nothing, nothing)
 
 
-def _start_lines(
-    first: LeafBases, second: LeafBases, up: Floats | None, *, size: float
-) -> list[tuple[Floats, Floats]]:
+def _start_lines(first: LeafBases, second: LeafBases, up: Floats | None, *, size: float) -> list[tuple[Floats, Floats]]:
     """Points and directions of lines near which an axis may lie: of many lines, those that most rays pass."""
     bases = first.points
     middle, meeting = np.median(bases, axis=0), _nearest_to_rays(bases, first.ahead)
@@ -309,9 +307,7 @@ def _look_back(bases: LeafBases, curve: Floats) -> Floats:
     return np.asarray(np.cos(turn) * back - np.sin(turn) * level)
 
 
-def _nearest_on_rays(
-    bases: LeafBases, back: Floats, curve: Floats, t: Floats
-) -> tuple[Floats, Floats, Floats]:
+def _nearest_on_rays(bases: LeafBases, back: Floats, curve: Floats, t: Floats) -> tuple[Floats, Floats, Floats]:
     """Places (N,) on rays that are nearest to a curve (P, 3), among t (N, R) in lengths of the leaves; their distances
     (N,), and their places (N,) along the curve."""
     rays = bases.points[:, None] + (t * bases.lengths[:, None])[..., None] * back[:, None]

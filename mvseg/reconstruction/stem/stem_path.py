@@ -117,9 +117,7 @@ def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> tuple[Floats, float
     return line, float(np.median(gap[close])), float(cells.share[members[close]].mean())
 
 
-def _find_petioles(
-    graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats
-) -> dict[int, Floats]:
+def _find_petioles(graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats) -> dict[int, Floats]:
     """{leaf: (n, 3) the cheapest path from the line, or from where it goes on beyond its ends, to the leaf}."""
     ends = np.array([[line[0], line[3]], [line[-1], line[-4]]])
     ahead = ends[:, 0] - ends[:, 1]
@@ -130,9 +128,7 @@ def _find_petioles(
     sources = np.flatnonzero(gap < THIN.line_cells * cells.size + THIN.cone * away)  # the stem may bend there
     if not len(sources):
         return {}
-    cost, before, _ = dijkstra(
-        graph.matrix, directed=False, indices=sources, min_only=True, return_predecessors=True
-    )
+    cost, before, _ = dijkstra(graph.matrix, directed=False, indices=sources, min_only=True, return_predecessors=True)
     petioles = {}
     for leaf, index in graph.leaf_index.items():
         if np.isfinite(cost[index]):

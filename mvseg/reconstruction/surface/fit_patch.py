@@ -62,9 +62,7 @@ def approach_patches(masks: MaskStack, starts: Floats, *, steps: range) -> tuple
     return _from_unit_worlds(coefficients, starts), offsets
 
 
-def fit_patch(
-    masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None
-) -> PatchFit:
+def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None) -> PatchFit:
     """Fit one patch (26, 3) to the masks of its leaf, see `fit_patches`."""
     return fit_patches(masks, start[None], num_steps=num_steps, errors=errors)[0]
 

@@ -26,7 +26,6 @@ NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 
 
-
 def place_stations(num_rows: int) -> Floats:
     """(num_rows,) places u from 0 to 1, denser at both ends, where the outline is round."""
     t = np.linspace(0, 1, num_rows)

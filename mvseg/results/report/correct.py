@@ -99,8 +99,9 @@ def describe_questions(result: Result, pictures: Sequence[Picture]) -> list[dict
     photos = result.photos if result.photos is not None and result.photos.exist else None
     return [
         _describe_question(question, pictures, cameras.sizes.tolist())
-        for question in list_mask_questions(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected,
-        photos=photos)
+        for question in list_mask_questions(
+            result.masks, result.surfaces, cameras=cameras, rejected=result.rejected, photos=photos
+        )
     ]
 
 

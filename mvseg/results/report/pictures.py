@@ -16,11 +16,11 @@ from mvseg.masks import SURE, Masks
 from mvseg.results.overlay import Box, find_plant, find_thickest
 
 LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # limit: pixels of a picture, at most and at least
-ALL_PIXELS = 24_000_000  # limit: pixels of all pictures together, at most: 4 to 9 MB, large enough to correct masks in
+ALL_PIXELS = 24_000_000  # limit: max. pixels of all pictures together: 4 to 9 MB, large enough to correct masks in
 THUMBNAIL_WIDTH = 320  # limit: pixels of a thumbnail, which is also shown around the picture of the plant
 QUALITY = 80  # chosen: quality of JPEG pictures
 UNITS = 2000  # limit: units across the picture of a view: the numbers of its outlines are whole ones
-TOLERANCE = 1.5  # limit: distance of an outline from the edge of its mask, in units, at most
+TOLERANCE = 1.5  # limit: max. distance of an outline from the edge of its mask, in units
 LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # limit: units of the height of a number in the picture, at least and at most
 
 

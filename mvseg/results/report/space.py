@@ -30,7 +30,7 @@ from mvseg.traits.up import level_frame
 Floats = NDArray[np.float64]
 
 MESH_SHAPE = (24, 9)  # limit: grid of a surface: 352 triangles
-VOXEL_FACES = 700  # limit: triangles of a leaf of voxels, at most
+VOXEL_FACES = 700  # limit: max. triangles of a leaf of voxels
 STEPS = 32767  # limit: steps of a coordinate from 0 to 1: 16 bits
 PLANT_SHARE = 0.25  # chosen: radius of a plant without shapes, as a share of the distance of its cameras
 LEVEL = 0.3  # chosen: length of the mean up vector of the cameras, from which it is used as that of the plant

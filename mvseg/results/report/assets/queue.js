@@ -17,7 +17,7 @@ function askAbout(doubt, { data }) {
       : `Photo ${view}: is this ${leaf}?${beside}`;
     case "unmatched": return `Photo ${view}: this mask was found in no other photo. Is it a leaf?`;
     case "few":
-      return `Leaf ${doubt.leaf} was found in ${doubt.found} of ${doubt.expected} photos that should show it. ` +
+      return `Leaf ${doubt.leaf} was found in ${doubt.num_found} of ${doubt.num_expected} photos that should show it. ` +
         "Is it a leaf?";
     case "surface": return `Photo ${view}: this mask does not fit the shape of ${leaf}. Is it that leaf?${beside}`;
     case "covered": return `Photo ${view}: ${leaf} should be here. Is it this mask?${beside}`;
