@@ -218,8 +218,7 @@ def _ask_rejected(
 def _ask_view(
     masks: Masks, painted: Ints, should: Bools, *, view: int, taken: Bools, evidence: Evidence
 ) -> list[MaskQuestion]:
-    """Questions about leaves that one view should show and does not. `should` (K + 1, V) gets True where it should show
-    one; `painted` (H, W) is from `paint_view`, `taken` (H, W) is True in masks, the columns of `evidence` are ids.
+    """Questions about leaves that one view should show and does not.
 
     `should` (K + 1, V) gets True where it should show one; `painted` (H, W) is from `paint_view`, `taken` (H, W) is
     True in masks, the columns of `evidence` are ids.

@@ -198,10 +198,9 @@ def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
 
 
 def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> float:
-    """Cost of an axis: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3). Leaves in two rows
-    point to any line between the rows: petioles are alike on both sides.
+    """Cost of an axis: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3).
 
-    Leaves in two rows point to any line between these: petioles are alike on both sides.
+    Leaves in two rows point to any line between the rows: petioles are alike on both sides.
     """
     squares = (distances / (AXES.near * size)) ** 2
     petioles = np.linalg.norm(bases.points - nodes, axis=1) / bases.lengths

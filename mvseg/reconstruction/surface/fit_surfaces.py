@@ -202,9 +202,7 @@ def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
 
 def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:
     """The right masks of each leaf, and a fit from its start, or the best of several fits from starts that are searched
-    for. The spread of a fit is that of the areas of nearly equally good ones.
-
-    Of several fits the best one, and how far the areas of nearly as good ones are from its own.
+    for. Its spread is that of the areas of nearly equally good fits.
     """
     searched = iter(find_starts([each.masks for each in asked if each.start is None], is_rough=is_rough))
     given = [next(searched) if each.start is None else (each.masks, [each.start]) for each in asked]
