@@ -8,6 +8,7 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import torch
 
 import mvseg
 from found_masks import FoundMasks, see_masks
+from known_leaves import bent_blade
 from mvseg import (
     InputError,
     MatchConfig,
@@ -40,10 +42,10 @@ from mvseg.formats.scene_folder import read_masks
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.finish import _find_doubtful, shape_leaves
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant, match_given
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
@@ -397,3 +399,13 @@ def test_warnings_before_an_error_are_given(plant: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr("mvseg.pipeline.run_scene.match_given", fail)
     with warns_of("dark_photo"), pytest.raises(InputError, match="view 4 is missing"):
         run_scene(plant, plant / "masks", IDS_ONLY)
+
+
+def test_shapes_are_doubtful_unless_areas_are_as_good_as_without_the_reason() -> None:
+    codes = ([], ["shows_more"], ["shows_more", "two_views"], ["poor_fit"])
+    surfaces = {
+        leaf: replace(bent_blade(), quality=Quality(dict.fromkeys(each, "why"))) for leaf, each in enumerate(codes, 1)
+    }
+    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces))  # type: ignore[arg-type]
+    assert finding.values == {"count": 2, "total": 4, "leaves": ("3", "4")}
+    assert _find_doubtful(SimpleNamespace(surfaces={1: surfaces[2]})) is None  # type: ignore[arg-type]

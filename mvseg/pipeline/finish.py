@@ -130,7 +130,7 @@ def _find_missing(plant: Plant, result: Result) -> Finding | None:
 
 def _find_doubtful(result: Result) -> Finding | None:
     surfaces = result.surfaces or {}
-    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good)
+    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_harmless)
     if not leaves:
         return None
     values: Values = {"count": len(leaves), "total": len(surfaces), "leaves": leaves}

@@ -14,7 +14,7 @@ from mvseg.errors import check_arguments
 from mvseg.formats.photos import Photos
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import HARMLESS, LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
@@ -31,8 +31,7 @@ NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
 TILT_DEG = 10.0  # fitted: python benchmarks/stems.py --cache DIR --up; root mean square of stems against up
 NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
 GOOD = "good"
-# Codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each (docs/traits.md).
-HARMLESS, USELESS = {"shows_more"}, {"poor_fit"}
+USELESS = {"poor_fit"}  # codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each
 Use = Literal["yes", "look", "no"]
 NO_MASKS = LeafSurface.none(torch.zeros(0, dtype=torch.int64), "no_masks", "has no masks")
 
