@@ -10,7 +10,7 @@ the paper.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -80,10 +80,9 @@ def check_ids(
     leaf = np.where(is_moved, to, leaf)
     names = np.concatenate((names, table.num_instances + 1 + np.arange(len(candidates) - len(names)), [-1]))
     ids = names[leaf]
-    merged = {each.region: each for each in table.merged if not is_moved[each.region] and (ids == each.other).any()}
-    pairs = {(each.region, each.own, each.other) for each in merged.values()}
-    shared = find_shared(table, candidates, drawn, leaf, names=names, cameras=cameras, pairs=pairs)
-    merged |= {each.region: each for each in shared}
+    named = [each for each in table.merged if not is_moved[each.region] and (ids == each.other).any()]
+    shared = find_shared(table.with_merged(named), candidates, drawn, leaf, names=names, cameras=cameras)
+    merged = {each.region: each for each in (*named, *shared)}
     scores = torch.from_numpy(np.where(is_moved, chosen.q, table.match_scores.double().numpy())).float()
     checked = replace(
         table,
@@ -136,7 +135,6 @@ def find_shared(
     *,
     names: Ints,
     cameras: Cameras,
-    pairs: Set[tuple[int, int, int]] = frozenset(),
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 
@@ -145,13 +143,13 @@ def find_shared(
     the pixels that are nearer to the visible part of the second surface than to that of the first.
 
     Args:
-        masks: D masks with the ids of the matcher.
+        masks: D masks with the ids of the matcher, and the pairs of leaves that it named (`Masks.merged`).
         candidates: K.
         drawn: V views of both.
         leaf: (D,) the candidate that each mask shows; -1 for none.
         names: (K + 1,) ids of the candidates.
-        pairs: (mask, own id, other id) that the matcher named.
     """
+    pairs = {(each.region, each.own, each.other) for each in masks.merged}
     regions, every, index = masks.regions, np.arange(len(leaf)), np.arange(len(candidates))
     is_there = np.isin(index, leaf) & np.isin(names[:-1], masks.instance_ids) & candidates.is_credible
     inside = np.where(is_there, see(drawn, len(leaf), is_there).inside, 0.0)
