@@ -24,8 +24,8 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import learn as module
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.learn import choose_weights, learn
-from mvseg.pipeline.open_scene import Opened, open_scene
+from mvseg.pipeline.learn import learn
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
@@ -128,28 +128,6 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
     assert len(taught) == 3  # the views disagree about the leaves
     with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):
         RunConfig(learn=0)
-
-
-@pytest.mark.parametrize(("growth", "is_better"), [(1.02, False), (1.04, True), (0.5, False)])
-def test_the_views_choose_between_the_weights_of_another_plant_and_their_own(
-    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, growth: float, is_better: bool
-) -> None:
-    plant = lower(see(leafy, monkeypatch), 0.5)
-    asked: list[str | None] = []
-
-    def look(opened: Opened, *, cache: CachedDetections) -> Plant:
-        asked.append(opened.config.detect.weights)
-        return replace(lower(plant, 0.5 * growth**0.5), opened=opened)  # the area grows with the square of P
-
-    monkeypatch.setattr(module, "find_in_photos", look)
-    monkeypatch.setattr(module, "_at_size", lambda path, size: f"{path.name} at {size}".encode())
-    seen = choose_weights(plant, tmp_path / "fig.safetensors", cache=CachedDetections(tmp_path))
-    assert asked == [str(tmp_path / "fig.safetensors")]
-    assert seen.opened is plant.opened
-    assert seen.learned.rounds == 0
-    assert seen.learned.weights == (f"fig.safetensors at {SIZE}".encode() if is_better else None)
-    assert seen.learned.agreed_area == pytest.approx((plant.rating, growth * plant.rating))
-    assert seen.rating == pytest.approx(seen.learned.agreed_area[is_better])
 
 
 @pytest.mark.slow

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import chain
 from pathlib import Path
 
 from mvseg._version import made_by
-from mvseg.batch.scene_list import BatchScene, list_scenes, with_teachers
+from mvseg.batch.scene_list import BatchScene, list_scenes
 from mvseg.batch.status import STATE, TABLES, Status, scene_state, write_status
 from mvseg.batch.tables import write_tables
 from mvseg.batch.work import Finished, work_on_scene
@@ -50,8 +51,7 @@ def run_batch(
     Args:
         source: a table or a folder of scenes, see `list_scenes`.
         out: folder of the results; made when missing.
-        config: the options of all scenes. With a number for `learn`, the detector learns the first plant of each
-            species (the table's column of that name; without one, all are of one), and all others are seen with it.
+        config: the options of all scenes.
         masks: in each scene folder, or beside them; None: a detector finds them.
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
@@ -64,8 +64,6 @@ def run_batch(
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     scenes = list_scenes(source, out, masks)
-    if isinstance(config.learn, int):
-        scenes = with_teachers(scenes)
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)
     place = resolve_place(out)
@@ -122,8 +120,7 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
-    """Run all scenes in parallel, teachers first. Scenes whose worker died run once more, one at a time, when memory is
-    free again. Where a teacher fails, the next scene of its species teaches."""
+    """Run all scenes in parallel. Scenes whose worker died run once more, one at a time, when memory is free again."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
     running: dict[int, str] = {}  # in the order in which they began
@@ -136,28 +133,15 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
         running[index] = scenes[index].name
         show()
 
-    def rounds() -> Iterator[tuple[bool, dict[int, BatchScene]]]:
-        waiting, asked = dict(enumerate(scenes)), dict(enumerate(scenes))
-        while waiting:
-            done = {scenes[index].name for index, each in finished.items() if each.status.state == "done"}
-            now = {index: each for index, each in waiting.items() if each.teacher is None or each.teacher in done}
-            if not now:
-                waiting = _replace_teachers(waiting)
-            else:
-                waiting = {index: each for index, each in waiting.items() if index not in now}
-                asked |= now
-                yield False, now
-        for index in again:
-            yield True, {index: asked[index]}
-
     with progress_bar(total=len(scenes), name="batch", unit="scene") as bar:
-        for is_last, items in rounds():
+        waiting = dict(enumerate(scenes))
+        for items in chain([waiting], ({index: scenes[index]} for index in again)):
             try:
                 with closing(engine(items, start)) as answers:
                     for index, answer in answers:
                         del running[index]
                         show()
-                        if isinstance(answer, Lost) and not is_last:
+                        if isinstance(answer, Lost) and items is waiting:
                             say_beside_bars(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
                             again.append(index)
                             continue
@@ -169,20 +153,6 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
                 for index in running:  # killed workers did not clean up
                     sweep_abandoned(out / scenes[index].name)
     return finished
-
-
-def _replace_teachers(waiting: Mapping[int, BatchScene]) -> dict[int, BatchScene]:
-    """The same scenes after their teachers have failed: the first one of each failed teacher now teaches the others."""
-    first: dict[str | None, str] = {}
-    for scene in waiting.values():
-        if first.setdefault(scene.teacher, scene.name) == scene.name:
-            failed = f"{scene.teacher}: failed, so that it teaches no other plant"
-            say_beside_bars(f"{failed}; {scene.name} teaches in its place")
-    teachers = {index: first[scene.teacher] for index, scene in waiting.items()}
-    return {
-        index: replace(scene, teacher=None if teachers[index] == scene.name else teachers[index])
-        for index, scene in waiting.items()
-    }
 
 
 def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:

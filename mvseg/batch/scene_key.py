@@ -21,8 +21,8 @@ def scene_key(scene: Scene, request: RunRequest) -> str:
     """The hash of a scene's inputs and of the options of a request.
 
     It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
-    reading gigabytes; without masks, the detector's weights, and those that another plant taught; all options and
-    mvseg's code; but not the paths of the files. Hidden files are ignored.
+    reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
+    files. Hidden files are ignored.
 
     Raises:
         InputError: a file cannot be read, or the weights are not there.
@@ -33,8 +33,7 @@ def scene_key(scene: Scene, request: RunRequest) -> str:
             from mvseg.detectors.zoo import weights_path  # loads torchvision
 
             options["detect"]["weights"] = None  # their hash counts, not their name
-            weights = (Path(weights_path(request.config.detect.weights)), request.taught)
-            others: Any = [None if path is None else hash_files(path) for path in weights]
+            others: Any = hash_files(Path(weights_path(request.config.detect.weights)))
         else:
             del options["detect"]
             others = [_describe_file(path, masks) for path in _mask_files(masks)]

@@ -6,7 +6,7 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.batch.status import STATE, TABLES
@@ -16,7 +16,7 @@ from mvseg.formats.text_file import read_table
 from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks", "corrections")
-KNOWN_COLUMNS = (*OWN_COLUMNS, "plant", "time", "species")  # in any case
+KNOWN_COLUMNS = (*OWN_COLUMNS, "plant", "time")  # in any case
 # of summary.csv, behind those of the scene
 SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
 RESERVED = {STATE, TABLES}
@@ -35,7 +35,6 @@ class BatchScene:
         beside: where a relative path of masks or corrections may start, besides the scene folder; absolute.
         carried: its cells that are copied into all tables, {column: text}: `plant`, `time`, then the table's other
             columns.
-        teacher: name of the scene whose plant the detector has learned, and that is worked on first; None: none.
     """
 
     name: str
@@ -44,19 +43,6 @@ class BatchScene:
     beside: Path
     carried: dict[str, str]
     corrections: Path | None = None
-    teacher: str | None = None
-
-
-def with_teachers(scenes: Sequence[BatchScene]) -> tuple[BatchScene, ...]:
-    """The same scenes; the first of each species that has no masks teaches the detector for the others. (The column of
-    that name; without one, all are of one species.)"""
-    first: dict[str, str] = {}
-    taught = []
-    for scene in scenes:
-        species = scene.carried.get("species", "").casefold()
-        teacher = None if scene.masks is not None else first.setdefault(species, scene.name)
-        taught.append(replace(scene, teacher=None if teacher == scene.name else teacher))
-    return tuple(taught)
 
 
 def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:

@@ -6,14 +6,13 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
-from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, collect_warnings, say_fault
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, Output, check_out
@@ -48,7 +47,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         earlier = read_status(folder)
         try:
             request = RunRequest(scene.folder, scene.masks, place, config, corrections=scene.corrections)
-            request = _with_teacher(request, scene, out).with_found(scene.beside)
+            request = request.with_found(scene.beside)
             with collect_warnings():  # the run itself gives them
                 key = scene_key(load_scene(scene.folder), request)
             if earlier is not None and earlier.key == key and _is_done(earlier, place):
@@ -61,16 +60,6 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         status = status.model_copy(update={"key": key, "seconds": seconds, "peak_mb": _peak_mb()})
         write_status(folder, status)
     return Finished(status)
-
-
-def _with_teacher(request: RunRequest, scene: BatchScene, out: Path) -> RunRequest:
-    """The same request with the weights that the scene's teacher has learned, if it has learned any. The detector does
-    not learn this plant, too."""
-    if scene.teacher is None:
-        return request
-    taught = out / scene.teacher / DETECTOR_FILE
-    config = replace(request.config, learn="off")
-    return replace(request, config=config, taught=taught if taught.is_file() else None)
 
 
 def _is_done(status: Status, result: Path) -> bool:

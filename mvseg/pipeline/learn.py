@@ -25,7 +25,7 @@ from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import find_in_photos, plant_of_pass, run_near
+from mvseg.pipeline.find_in_photos import plant_of_pass, run_near
 from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
@@ -88,28 +88,6 @@ def learn(
     except InputError as error:
         warn(Finding("learning_failed", values={"reason": str(error)}))
     return replace(best, learned=replace(best.learned, agreed_area=tuple(areas)))
-
-
-def choose_weights(plant: Plant, taught: Path, *, cache: CachedDetections) -> Plant:
-    """Look at a plant with the weights that another one of its species taught, too; the views choose, as after a round.
-
-    Args:
-        plant: of leaves that the views chose, with the weights that the run began with.
-        taught: file of the other weights.
-
-    Returns:
-        The plant as it was, or as the detector sees it with the taught weights, at the size that is best with these.
-    """
-    opened = plant.opened
-    detect = replace(opened.config.detect, weights=str(taught))
-    report_step("looking again, with the weights that another plant of the species taught")
-    with collect_warnings():
-        other = find_in_photos(replace(opened, config=replace(opened.config, detect=detect)), cache=cache)
-    areas = (plant.rating, other.rating)
-    if other.rating < GROWTH * plant.rating:
-        return replace(plant, learned=Learned(agreed_area=areas))
-    weights = _at_size(taught, other.image_size)
-    return replace(other, opened=opened, learned=Learned(weights=weights, agreed_area=areas))
 
 
 def _count_rounds(plant: Plant) -> int:

@@ -35,7 +35,6 @@ def run_scene(
     corrections: Corrections | Path | str | None = None,
     force_corrections: bool = False,
     cache: Path | str | None = None,
-    taught: Path | None = None,
 ) -> Result:
     """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
 
@@ -46,8 +45,6 @@ def run_scene(
         cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
             options is deleted; `delete_cached` deletes the rest.
-        taught: file of weights that another plant of the species taught: the detector learns nothing here, and the
-            views choose between these weights and its own (`choose_weights`).
 
     Returns:
         The result; nothing is written but what `cache` says.
@@ -68,14 +65,11 @@ def run_scene(
                 plant = match_given(opened)
             else:
                 from mvseg.pipeline.find_in_photos import find_in_photos  # loads torchvision
-                from mvseg.pipeline.learn import choose_weights, learn
+                from mvseg.pipeline.learn import learn
 
                 detections = CachedDetections(Path(cache or place))
                 plant = find_in_photos(opened, cache=detections)
-                if taught is None:
-                    plant = learn(plant, cache=detections, corrections=corrections)
-                else:
-                    plant = choose_weights(plant, taught, cache=detections)
+                plant = learn(plant, cache=detections, corrections=corrections)
                 detections.delete_others()
         edited, before = apply_edits(plant, corrections), None
         if edited.edits:

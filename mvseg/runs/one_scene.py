@@ -115,7 +115,6 @@ def solve_scene(request: RunRequest, *, cache: Path) -> Solved:
             corrections=request.corrections,
             force_corrections=request.force_corrections,
             cache=cache,
-            taught=request.taught,
         )
     if request.learned.weights is not None:
         result = replace(result, learned=request.learned)

@@ -28,7 +28,6 @@ class RunRequest:
         force_corrections: apply them even if they were made for other photos.
         overwrite: replace another scene's result, output of another command, or detected masks in `out`.
         learned: weights that have learned this scene before; they are used, and nothing is learned again.
-        taught: file of weights that another plant of the species taught, see `run_scene`; None: none did.
     """
 
     scene: Path
@@ -39,7 +38,6 @@ class RunRequest:
     force_corrections: bool = False
     overwrite: bool = False
     learned: Learned = NOTHING_LEARNED
-    taught: Path | None = None
 
     @property
     def inputs(self) -> tuple[Path, ...]:

@@ -20,8 +20,7 @@ from batch_work import run_here
 from mvseg.batch import run_batch as batch
 from mvseg.batch import workers
 from mvseg.batch.run_batch import BatchCounts, run_batch
-from mvseg.batch.status import Status, read_status, scene_state
-from mvseg.batch.work import Finished
+from mvseg.batch.status import read_status, scene_state
 from mvseg.batch.workers import Lost
 from mvseg.cli import main
 from mvseg.cli.command import build_parser
@@ -174,32 +173,6 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
     status = read_status(scene_state(tmp_path / "out", "basil"))
     assert status is not None
     assert (status.state, status.sentence) == ("failed", sentence)
-
-
-def test_where_a_teacher_fails_the_next_scene_of_its_species_teaches(
-    plants: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """cactus holds nothing; ox and yew follow mint, which takes its place."""
-    rounds = []
-
-    def run(work: Any, items: Any, started: Any, *, num_workers: int) -> Iterator[tuple[int, Any]]:
-        rounds.append([(item.name, item.teacher) for item in items.values()])
-        for key, item in items.items():
-            started(key)
-            state = "failed" if item.name == "cactus" else "done"
-            yield key, Finished(Status(state=state, scene=item.name, sentence="nothing there"))
-
-    monkeypatch.setattr(workers, "run_locally", run)
-    monkeypatch.setattr(batch, "write_tables", lambda *_, **__: None)
-    table = plants / "all.csv"
-    rows = [("cactus", "fig"), ("mint", "Fig"), ("basil", "ivy"), ("ox", "fig"), ("yew", "fig")]
-    table.write_text("scene,species\n" + "".join(f"{name},{species}\n" for name, species in rows))
-    run_batch(table, tmp_path / "out", RunConfig(learn=1))
-    assert rounds == [
-        [("cactus", None), ("basil", None)], [("mint", None)], [("ox", "mint"), ("yew", "mint")]
-    ]  # fmt: skip
-    said = capsys.readouterr().err
-    assert "mvseg: cactus: failed, so that it teaches no other plant; mint teaches in its place\n" in said
 
 
 @pytest.mark.slow

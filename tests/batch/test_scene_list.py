@@ -55,7 +55,7 @@ def test_tables_with_semicolons_and_names(tmp_path: Path) -> None:
 
 def test_names_of_columns_in_any_case(tmp_path: Path) -> None:
     (scene,) = list_scenes(write(tmp_path, "Scene,Plant,Species,Genotype,\na,b,Fig,X,\n"), OUT, None)
-    assert scene.carried == {"plant": "b", "time": "", "species": "Fig", "Genotype": "X"}
+    assert scene.carried == {"plant": "b", "time": "", "Species": "Fig", "Genotype": "X"}
 
 
 def test_every_sub_folder_is_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,16 +16,13 @@ import torch
 from PIL import Image, ImageOps
 
 from mvseg.batch import work as batch_work
-from mvseg.batch.scene_key import scene_key
-from mvseg.batch.scene_list import BatchScene, with_teachers
+from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
 from mvseg.detection import mask_rcnn
 from mvseg.detection.config import DetectConfig
-from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.config import MatchConfig
-from mvseg.runs.request import RunRequest
 from mvseg.system.atomic import lock_folder
 from scene_folders import edit_rig, write_scene
 
@@ -221,33 +218,3 @@ def test_a_status_of_another_kind_counts_as_none(tmp_path: Path) -> None:
     assert read_status(tmp_path) is None
     assert read_status(tmp_path / "nothing") is None
     assert Status(state="done", scene="x").peak_mb is None
-
-
-def test_the_first_plant_of_a_species_teaches_the_others(scene: BatchScene, tmp_path: Path) -> None:
-    plain = replace(scene, masks=None)
-    table = [
-        replace(plain, name=name, carried={"species": species}, masks=masks)
-        for name, species, masks in (
-            ("a", "fig", Path("masks")), ("b", "fig", None), ("c", "ivy", None), ("d", "Fig", None), ("e", "ivy", None)
-        )
-    ]  # fmt: skip
-    taught = with_teachers(table)
-    assert [each.teacher for each in taught] == [None, None, None, "b", "c"]
-    assert [each.teacher for each in with_teachers([replace(plain, name=name) for name in "xy"])] == [None, "x"]
-    request = RunRequest(scene.folder, None, tmp_path / "d", replace(CONFIG, learn=2))
-    assert batch_work._with_teacher(request, taught[1], tmp_path) == request
-    untaught = replace(request, config=replace(CONFIG, learn="off"))
-    assert batch_work._with_teacher(request, taught[3], tmp_path) == untaught  # nothing was learned
-    weights = tmp_path / "b" / "detector.safetensors"
-    weights.parent.mkdir()
-    weights.touch()
-    assert batch_work._with_teacher(request, taught[3], tmp_path) == replace(untaught, taught=weights)
-
-
-def test_the_key_of_a_scene_depends_on_the_weights_that_taught_it(scene: BatchScene, tmp_path: Path) -> None:
-    opened, request = load_scene(scene.folder), RunRequest(scene.folder, None, tmp_path / "out", CONFIG)
-    keys = {scene_key(opened, request)}
-    for content in (b"one", b"two"):
-        (tmp_path / "taught.safetensors").write_bytes(content)
-        keys.add(scene_key(opened, replace(request, taught=tmp_path / "taught.safetensors")))
-    assert len(keys) == 3
