@@ -158,7 +158,6 @@ def fit(studies: list[Study]) -> LeafScores:
             matched=regress(FITTED.matched, np.concatenate(matched[0]), np.concatenate(matched[1])),
             leaf=regress(FITTED.leaf, np.array(leaves[True][0]), np.array(leaves[True][1])),
             leaf_matched=regress(FITTED.leaf_matched, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
-            finer=FITTED.finer,
         )
     return fitted
 

@@ -83,7 +83,7 @@ def outline_some(plant: Plant, truth: list[Labels]) -> Corrections:
 
 def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, begun: float) -> tuple[float, float]:
     """Print a row; the agreed area and MV-PQ, NaN without a truth."""
-    area = 100 * plant.agreed_area / int(plant.scene.cameras.sizes.prod(1).sum())
+    area = 100 * plant.rating.agreed_area / int(plant.scene.cameras.sizes.prod(1).sum())
     row: dict[str, Any] = {"": name, "agreed area": f"{area:.2f}", "stays": stays}
     row |= judge(shape_leaves(plant).masks.to("cpu"), truth) | {"CPU s": f"{time.process_time() - begun:.0f}"}
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
@@ -96,7 +96,7 @@ def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
     opened = open_scene(folder, None, RunConfig(reconstruct=None))
     plant = learn(find_in_photos(opened, cache=cache), cache=cache)
     masks, truth = shape_leaves(plant).masks.to("cpu"), true_maps(folder, opened.scene)
-    figures, area = leaf_metrics(masks.regions, masks.instance_ids, truth), 100 * plant.agreed_area
+    figures, area = leaf_metrics(masks.regions, masks.instance_ids, truth), 100 * plant.rating.agreed_area
     chances = torch.tensor([0.0, *(plant.instances.probabilities[n] for n in range(1, masks.num_instances + 1))])
     expected = float((chances[masks.instance_ids.clamp(min=0)] * masks.match_scores).sum())
     of_mask = true_instances(masks.regions, truth, count_background=False)
@@ -172,7 +172,7 @@ def main() -> None:
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
-            stays = stays and plant.rating >= GROWTH * before.rating
+            stays = stays and plant.rate_by(before).agreed_area > GROWTH * before.rating.agreed_area
             name = f"round {number}, at {plant.image_size} px"
             runs.append(show(name, plant, truth, stays="yes" if stays else "no", begun=begun))
             if args.next is not None:

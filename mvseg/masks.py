@@ -24,7 +24,6 @@ COLUMNS = (  # that are tensors
     "instance_ids",
     "match_scores",
     "detection_scores",
-    "resolution",
     "classes",
     "origin",
     "is_linked",
@@ -69,8 +68,6 @@ class Masks:
         instance_ids: (D,) int64, the same number in [1, K] for masks of one instance; -1 = matched to nothing.
         match_scores: (D,) float32 in [0, 1], see `Matching.match_scores`.
         detection_scores: (D,) float32, the detector's; NaN for masks that no detector scored.
-        resolution: (D,) float32, root of its area in pixels as the detector saw it, of proposals of several passes at
-            different sizes; NaN elsewhere.
         classes: (D,) int64; masks of different classes are never matched.
         origin: (D,) int64, of `Origin`.
         is_linked: (D,) bool, the user says which other masks show its instance, or do not.
@@ -85,7 +82,6 @@ class Masks:
     instance_ids: Tensor
     match_scores: Tensor
     detection_scores: Tensor
-    resolution: Tensor
     classes: Tensor
     origin: Tensor
     is_linked: Tensor
@@ -118,7 +114,6 @@ class Masks:
             instance_ids=-integer if instance_ids is None else instance_ids,
             match_scores=torch.zeros(count, device=device) if match_scores is None else match_scores,
             detection_scores=integer * torch.nan if detection_scores is None else detection_scores,
-            resolution=integer * torch.nan,
             classes=integer if classes is None else classes,
             origin=int(origin) * integer,
             is_linked=integer < 0,

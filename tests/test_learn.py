@@ -87,6 +87,7 @@ def lower(plant: Plant, chance: float = 0.9) -> Plant:
         (3, (1.2, 1.2, 1.02), 3, 2),  # the third grows by too little
         (3, (1.02, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
+        (1, (0.0,), 1, 0),
         ("off", (1.2,), 0, 0),
         ("auto", (1.2, 1.2, 1.2), 2, 2),
     ],
@@ -107,7 +108,7 @@ def test_weights_stay_where_the_agreed_area_grows(
     assert seen.learned.rounds == kept
     assert seen.learned.weights == (f"weights {kept}".encode() if kept else None)
     assert len(seen.learned.agreed_area) == tried + 1
-    assert seen.agreed_area == pytest.approx(max(seen.learned.agreed_area[: kept + 1]))
+    assert seen.rating.agreed_area == pytest.approx(max(seen.learned.agreed_area[: kept + 1]))
     if not kept:
         assert torch.equal(seen.masks.instance_ids, plant.masks.instance_ids)
 
@@ -117,7 +118,7 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
 ) -> None:
     taught = teach(monkeypatch, 1.0)
     plant = see(leafy, monkeypatch, score=0.6)
-    assert learn(plant, cache=CachedDetections(tmp_path)).learned == Learned(agreed_area=(plant.agreed_area,))
+    assert learn(plant, cache=CachedDetections(tmp_path)).learned == Learned(agreed_area=(plant.rating.agreed_area,))
     assert not taught
     learn(see(leafy, monkeypatch, score=0.6, learn=1), cache=CachedDetections(tmp_path))
     assert len(taught) == 1
@@ -152,7 +153,7 @@ def test_what_was_there_stays_and_one_sentence_says_why(
     codes = {"few": "learned_too_few", "interrupt": "learning_interrupted", "fails": "learning_failed"}
     with warns_of(codes[reason]):
         seen = learn(plant, cache=CachedDetections(tmp_path))
-    assert seen.agreed_area == plant.agreed_area
+    assert seen.rating.agreed_area == plant.rating.agreed_area
     assert seen.learned.weights is None
 
 

@@ -26,6 +26,13 @@ def ids_before(masks: Masks, before: Masks) -> Tensor:
     return torch.tensor([known.get(name, -1) for name in name_regions(masks.regions)], dtype=torch.int64)
 
 
+def find_pairs(masks: Masks, pairs: Tensor, others: Masks) -> Tensor:
+    """(Q', 2) int64, pairs (Q, 2) of rows of a table as rows of another one that has both masks."""
+    names, row_of = name_regions(masks.regions), {name: row for row, name in enumerate(name_regions(others.regions))}
+    rows = [[row_of.get(names[row], -1) for row in pair] for pair in pairs.tolist()]
+    return torch.tensor([pair for pair in rows if min(pair) >= 0], dtype=torch.int64).reshape(-1, 2)
+
+
 def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
     """Find the leaves that edits mention but do not change: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.

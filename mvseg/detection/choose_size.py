@@ -1,8 +1,8 @@
 """At which size the detector sees the leaves of a plant best: the views decide.
 
 A detector knows leaves of some sizes in pixels. Which those are on a new plant, its scores do not tell; whether the
-views agree does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md). Not in
-the paper.
+views agree does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md); its
+degenerate optimum, the whole plant as one leaf, `order_ratings` excludes. Not in the paper.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 
 from mvseg.detection.find_leaves import PassResult
 from mvseg.detection.numbers import DETECTION
+from mvseg.verification.leaf_scores import order_ratings
 
 
 def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[PassResult]:
@@ -28,9 +29,9 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
     """
     results, size, num_misses = [first], float(first.passes[0].longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
-        found, best = see(round(size)), max(results, key=lambda each: each.agreed_area)
-        num_misses = 0 if found.agreed_area > best.agreed_area else num_misses + 1
-        results.append(found)
+        best = order_sizes(results)[0]
+        results.append(see(round(size)))
+        num_misses = 0 if order_sizes(results)[0] is results[-1] else num_misses + 1
         if num_misses > (best.leaves.agreement < DETECTION.clear_agreement):
             break
     return order_sizes(results)
@@ -52,7 +53,8 @@ def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> li
 
 
 def order_sizes(results: Sequence[PassResult]) -> list[PassResult]:
-    """The pass with the largest agreed area; of equals, the first. Then the second best, if its agreed area is at least
-    `DETECTION.as_good` times the best: the caller decides between the two by all views."""
-    ordered = sorted(results, key=lambda each: -each.agreed_area)
-    return [each for each in ordered[:2] if each.agreed_area >= DETECTION.as_good * ordered[0].agreed_area]
+    """The best pass, see `order_ratings`. Then the second best, if its agreed area is at least `DETECTION.as_good`
+    times as large: the caller decides between the two by all views."""
+    first, *others = [results[index] for index in order_ratings([each.rating for each in results])]
+    least = DETECTION.as_good * first.rating.agreed_area
+    return [first, *(each for each in others[:1] if first.rating.agreed_area >= each.rating.agreed_area >= least)]

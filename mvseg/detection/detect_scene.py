@@ -88,11 +88,12 @@ def _detect(
     device = next(model.parameters()).device
     with timed("detect"):
         for view in progress_bar(range(len(scene.views)), name="detection", unit="view"):
-            box = None if boxes is None else boxes[view].tolist()
+            whole = [0, 0, *scene.cameras.sizes[view].tolist()]
+            box = None if boxes is None or boxes[view].tolist() == whole else boxes[view].tolist()
             path = None if cache is None or not photos.exist else cache.path(photos, view, box, made_by=made_by)
             detections = None if path is None else read_detections(path)
             if detections is None:
-                x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())
+                x1, y1, x2, y2 = box or whole
                 photo = torch.from_numpy(photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
                 detections = model.detect(photo.float().div_(255))
                 if path is not None:

@@ -22,7 +22,7 @@ from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
 from mvseg.verification.choose import Leaves, choose_leaves
-from mvseg.verification.leaf_scores import rate_pass
+from mvseg.verification.leaf_scores import Rating, rate_pass
 
 
 class Detector(Protocol):
@@ -110,8 +110,7 @@ class PassResult:
         report: of the sure ones.
         pixel: width of a pixel of the detector in the first pass, in pixels of the photos.
         findings: to warn of, if the result stays.
-        alone_area: agreed area of the better pass alone, where there are two: with the proposals of two, it is larger
-            even if leaves are no better, so that weights are rated by one.
+        colored: (D,) share of each mask of the leaves that has leaf colour; None: it was not looked at.
     """
 
     passes: tuple[Pass, ...]
@@ -121,12 +120,12 @@ class PassResult:
     report: MatchReport
     pixel: float
     findings: tuple[Finding, ...] = ()
-    alone_area: float | None = None
+    colored: Tensor | None = None
 
     @property
-    def agreed_area(self) -> float:
-        """Pixels, see `rate_pass`."""
-        return rate_pass(self.leaves.masks, self.leaves.probabilities, pixel=self.pixel)
+    def rating(self) -> Rating:
+        """See `rate_pass`."""
+        return rate_pass(self.leaves.masks, self.leaves.probabilities, pixel=self.pixel, colored=self.colored)
 
 
 def find_leaves(
@@ -154,30 +153,6 @@ def find_leaves(
     nothing = Leaves(matched[0], {}, {}, ())
     result = PassResult((detected,), nothing, proposals, tuple(matched), detected.sure.report, pixel)
     return _choose(result, cameras, config=config, cache=cache) if config.verify else result
-
-
-def join_passes(
-    first: PassResult,
-    second: PassResult,
-    cameras: Cameras,
-    *,
-    config: DetectConfig = DetectConfig(),
-    cache: SurfaceCache | None = None,
-) -> PassResult:
-    """The views choose from the proposals of two passes over the same photos, at different sizes, as one set: masks
-    that the detector saw finer are likelier (`LeafScores.finer`)."""
-    sets = [
-        replace(each.proposals, resolution=each.proposals.regions.areas.float().sqrt() / each.pixel)
-        for each in (first, second)
-    ]
-    offset = len(first.proposals)
-    shifted = [
-        replace(each, regions=replace(each.regions, labels=each.regions.labels + offset)) for each in second.matched
-    ]
-    passes, proposals = (*first.passes, *second.passes), Masks.concatenate(sets)
-    matched, alone = (*first.matched, *shifted), first.agreed_area
-    both = replace(first, passes=passes, proposals=proposals, matched=matched, alone_area=alone)
-    return _choose(both, cameras, config=config, cache=cache)
 
 
 def _choose(result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None) -> PassResult:

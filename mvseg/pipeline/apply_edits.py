@@ -11,7 +11,7 @@ from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
-from mvseg.corrections.unchanged_leaves import ids_before, leave_joined, unchanged_leaves
+from mvseg.corrections.unchanged_leaves import find_pairs, ids_before, leave_joined, unchanged_leaves
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
@@ -68,6 +68,7 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
             more=plant.matched,
             removed=_removed_masks(editable, masks),
             previous=ids_before(masks, replace(corrected.masks, instance_ids=previous)),
+            apart=find_pairs(corrected.masks, corrected.links.cannot, masks),
             drawn=plant.drawn,
             min_probability=config.detect.min_probability,
             cache=opened.surfaces,

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.choose_size import choose_near, choose_size
+from mvseg.detection.choose_size import choose_near, choose_size, order_sizes
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
-from mvseg.detection.find_leaves import PassResult, find_leaves, join_passes
+from mvseg.detection.find_leaves import PassResult, find_leaves
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
@@ -22,13 +23,18 @@ from mvseg.pipeline.open_scene import Opened
 from mvseg.pipeline.plant import Plant, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.results.result import Instances
+from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
+from mvseg.verification.numbers import CHOICE
+
+Colors = NDArray[np.bool_]  # of leaves, see `leaf_colors`
 
 
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Plant:
     """Look for leaves in the photos; the views choose leaves and masks.
 
     The detector looks at several sizes, unless one is given: see `choose_size`. With twice as many photos as
-    `DETECTION.judging_views`, or more, so many of them choose the size, or the two between which all photos choose.
+    `DETECTION.judging_views`, or more, so many of them choose the size, or the two between which all photos choose. All
+    sizes are of the parts of the photos that the first pass chose.
 
     Raises:
         InputError: see `detect_scene`.
@@ -38,46 +44,41 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
     few, views = _select_judges(opened)
     first = run_pass(few, detect, cache=cache)
-    boxes = first.passes[0].boxes
+    colors = _colors_to_judge_by(few, first)
+    is_cropped = first.passes[0].boxes is not None
+    boxes = first.passes[0].boxes if is_cropped else whole_photos(few.scene)
 
     def see(size: int) -> PassResult:
-        return run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes)
+        return _judge(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
 
+    first = _judge(few, first, colors)
     best = choose_size(see, first)
     if few is opened:
-        return plant_of_pass(opened, _choose_pass(opened, best, detect))
-    if boxes is not None:
+        return plant_of_pass(opened, best[0])
+    boxes = whole_photos(opened.scene)
+    if is_cropped:
         masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
     if best[0] is first:  # a species that the detector knows: no other size is worth a pass over all photos
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=boxes))
     sizes = [None if each is first else each.passes[0].longest for each in best]
-    return plant_of_pass(opened, _run_in_all(opened, sizes, detect, cache=cache, boxes=boxes))
-
-
-def _run_in_all(
-    opened: Opened,
-    sizes: Sequence[int | None],
-    detect: DetectConfig,
-    *,
-    cache: CachedDetections | None,
-    boxes: Tensor | None,
-) -> PassResult:
-    """Run the detector over all views at one or two sizes (None: its own), and choose."""
     results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return _choose_pass(opened, sorted(results, key=lambda each: -each.agreed_area), detect)
+    return plant_of_pass(opened, order_sizes([_judge(opened, each, colors) for each in results])[0])
 
 
-def _choose_pass(opened: Opened, results: Sequence[PassResult], detect: DetectConfig) -> PassResult:
-    """Select from one or two passes, the better one first: the best one, or both as one set, by the largest agreed
-    area."""
-    best, *others = results
-    for other in others:
-        with collect_warnings():  # those of the passes say it
-            both = join_passes(best, other, opened.scene.cameras, config=detect, cache=opened.surfaces)
-        best = max(best, both, key=lambda each: each.agreed_area)
-    return best
+def _colors_to_judge_by(opened: Opened, first: PassResult) -> Colors | None:
+    """Leaf colours of the first pass, which may miss leaves but finds little else; None where it has too few leaves."""
+    masks = first.leaves.masks
+    is_known = opened.photos.exist and masks.num_instances >= CHOICE.least_leaves
+    return colors_of_leaves(masks, opened.photos) if is_known else None
+
+
+def _judge(opened: Opened, result: PassResult, colors: Colors | None) -> PassResult:
+    """The same with the share of leaf colour in each mask, by which passes are compared."""
+    if colors is None:
+        return result
+    return replace(result, colored=colored_shares(result.leaves.masks, opened.photos, colors))
 
 
 def _select_judges(opened: Opened) -> tuple[Opened, Tensor]:
@@ -94,17 +95,20 @@ def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | No
     """Run taught weights at the size that they have learned at, and at the sizes next to it, see `choose_near`; only at
     `DetectConfig.image_size`, where it is given."""
     opened, boxes = plant.opened, plant.boxes
+    colors = plant.leaf_colors if opened.photos.exist else None
     few, views = _select_judges(opened)
     if detect.image_size is not None:
         return run_pass(opened, detect, cache=cache, boxes=boxes)
 
     def see(size: int) -> PassResult:
-        return run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views])
+        return _judge(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views]), colors)
 
-    found = choose_near(see, plant.image_size, most=plant.longest_side)
+    results = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
-        return _choose_pass(opened, found, detect)
-    return _run_in_all(opened, [each.passes[0].longest for each in found], detect, cache=cache, boxes=boxes)
+        return results[0]
+    sizes = [each.passes[0].longest for each in results]
+    results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
+    return order_sizes([_judge(opened, each, colors) for each in results])[0]
 
 
 def run_pass(
@@ -144,6 +148,5 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
         boxes=whole_photos(opened.scene) if detected.boxes is None else detected.boxes,
         rejected=(),
         disagreement=opened.find_disagreement(matching),
-        alone_area=result.alone_area,
     )
     return plant.with_leaves(result.leaves) if opened.is_chosen else plant

@@ -33,7 +33,9 @@ from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import expected_minutes, report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
-from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
+from mvseg.training.view_labels import ViewLabels, label_views
+from mvseg.verification.leaf_scores import order_ratings
+from mvseg.verification.numbers import CHOICE
 from mvseg.verification.unexplained import is_familiar
 
 ROUNDS = 2  # limit: where nobody says how many; most plants gain nothing from a third one (docs/detector.md)
@@ -63,7 +65,7 @@ def learn(
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
-    best, areas = plant, [plant.rating]
+    best, areas = plant, [plant.rating.agreed_area]
     try:
         for number in range(1, (_count_rounds(plant) if rounds is None else rounds) + 1):
             with collect_warnings():  # of edits: they are warned of when they are finally applied
@@ -72,15 +74,17 @@ def learn(
             photos = plant.opened.photos
             labels = label_views(complete_masks(edited).masks, best.proposals, photos, probabilities=chances)
             if not labels.are_enough:
-                warn(Finding("learned_too_few", values={"count": labels.num_leaves, "least": LEAST_LEAVES}))
+                warn(Finding("learned_too_few", values={"count": labels.num_leaves, "least": CHOICE.least_leaves}))
                 break
             if number == 1 and rounds is None:
                 how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
                 report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             taught = _learn_once(best, labels, cache)
-            areas.append(taught.rating)
-            if rounds is None and taught.rating < GROWTH * best.rating:
+            before, after = best.rating, taught.rate_by(best)
+            areas.append(after.agreed_area)
+            is_better = order_ratings([before, after])[0] == 1 and after.agreed_area >= GROWTH * before.agreed_area
+            if rounds is None and not is_better:
                 break
             best = replace(taught, learned=replace(taught.learned, rounds=number))
     except KeyboardInterrupt:

@@ -23,8 +23,8 @@ from mvseg.scene import Scene
 from mvseg.system.running import timed
 from mvseg.verification.choose import add_beside
 from mvseg.verification.evidence import Drawn, draw_views
-from mvseg.verification.leaf_color import colors_of_leaves
-from mvseg.verification.leaf_scores import rate_pass
+from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
+from mvseg.verification.leaf_scores import Rating, rate_pass
 
 if TYPE_CHECKING:
     from mvseg.verification.choose import Leaves, RejectedCandidate
@@ -49,7 +49,6 @@ class Plant:
         edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
         learned: weights that the detector learned from this plant.
-        alone_area: see `PassResult`.
         disagreement: finding on views that disagree about the masks, see `find_disagreement`; None: they agree.
     """
 
@@ -66,7 +65,6 @@ class Plant:
     refused: tuple[RejectedPixel, ...] = ()
     learned: Learned = NOTHING_LEARNED
     disagreement: Finding | None = None
-    alone_area: float | None = None
 
     @property
     def scene(self) -> Scene:
@@ -78,16 +76,17 @@ class Plant:
         """The table of masks."""
         return self.matching.masks
 
-    @property
-    def agreed_area(self) -> float:
-        """Pixels, see `rate_pass`."""
-        pixel = self.longest_side / self.image_size
-        return rate_pass(self.masks, self.instances.probabilities, pixel=pixel)
+    @cached_property
+    def rating(self) -> Rating:
+        """See `rate_pass`; by the leaf colours of the plant itself."""
+        return self.rate_by(self)
 
-    @property
-    def rating(self) -> float:
-        """Agreed area of one pass, pixels, by which weights are compared; see `PassResult.alone_area`."""
-        return self.agreed_area if self.alone_area is None else self.alone_area
+    def rate_by(self, other: Plant) -> Rating:
+        """Rate by the leaf colours of the same plant, seen another time."""
+        masks, photos = self.masks.to("cpu"), self.opened.photos
+        colored = colored_shares(masks, photos, other.leaf_colors) if photos.exist else None
+        pixel = self.longest_side / self.image_size
+        return rate_pass(masks, self.instances.probabilities, pixel=pixel, colored=colored)
 
     @property
     def longest_side(self) -> int:

@@ -23,9 +23,9 @@ from mvseg.evaluation.labelled_photo import LabelledPhoto, mask_photo
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
+from mvseg.verification.numbers import CHOICE
 
 LIKELY = 0.5  # definition: P of a leaf that is learned: it is likelier a leaf than not
-LEAST_LEAVES = 3  # chosen: fewer say too little of a species
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,8 @@ class ViewLabels:
 
     @property
     def are_enough(self) -> bool:
-        """Whether there are `LEAST_LEAVES` to learn from."""
-        return self.num_leaves >= LEAST_LEAVES
+        """Whether there are `CHOICE.least_leaves` to learn from."""
+        return self.num_leaves >= CHOICE.least_leaves
 
     def in_photo(self, view: int, photo: np.ndarray, box: Box, *, size: tuple[int, int]) -> LabelledPhoto:
         """The labels of one view in a part of its photo.

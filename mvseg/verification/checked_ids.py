@@ -64,12 +64,8 @@ def check_ids(
     if masks.regions.num_views < AGAIN.least_views:
         is_held = is_held | (table.match_scores >= SURE)
     candidates, drawn = _gather([table], surfaces, cameras, is_held=is_held)
-    q = show_chances(
-        candidates,
-        see(drawn, len(table), candidates.is_credible),
-        given.double().numpy(),
-        table.resolution.double().numpy(),
-    )
+    evidence = see(drawn, len(table), candidates.is_credible)
+    q = show_chances(candidates, evidence, given.double().numpy())
     own = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), leaf]
     if (again := match_again(table, leaf, q=own, cameras=cameras, config=config)) is not None:
         candidates, drawn = _gather([table, again], surfaces, cameras, is_held=is_held, cache=cache)

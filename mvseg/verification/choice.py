@@ -141,12 +141,17 @@ def choose(
     drawn: Sequence[Drawn],
     usable: Bools | None = None,
     statements: Statements | None = None,
+    apart: Ints | None = None,
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
 ) -> Choice:
     """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
-    hide those behind them in the next."""
-    scores, resolution = table.detection_scores.double().numpy(), table.resolution.double().numpy()
+    hide those behind them in the next.
+
+    `apart` (Q, 2): masks that show different leaves, as the user says. Of each pair, a candidate can have the likelier
+    mask alone.
+    """
+    scores = table.detection_scores.double().numpy()
     statements = statements or Statements.nothing(len(table))
     excluded = ~same_class(candidates, table)
     if usable is not None:
@@ -155,8 +160,11 @@ def choose(
     hides, ranked = np.zeros(len(candidates), bool), None
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(candidates, evidence, scores, resolution, fitted), CHOICE.digits)
+        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
         q[excluded] = 0
+        for one, other in [] if apart is None else apart:
+            odds = q + candidates.certain
+            q[np.where(odds[one] < odds[other], one, other), np.arange(len(candidates))] = 0
         steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
         ranked = _accept(candidates, q, steps, statements, min_probability)
         hides = candidates.is_credible & np.isin(np.arange(len(candidates)), ranked.leaves)

@@ -70,6 +70,7 @@ def choose_leaves(
     more: Sequence[Masks] = (),
     removed: Masks | None = None,
     previous: Tensor | None = None,
+    apart: Tensor | None = None,
     drawn: Sequence[Drawn] = (),
     min_probability: float | None = None,
     cache: SurfaceCache | None = None,
@@ -89,6 +90,7 @@ def choose_leaves(
             user's masks are candidates here, and `more` has the others.
         previous: (D,) int64, the leaf of each mask before the edits, if they leave that leaf unchanged; otherwise -1.
             None: -1 everywhere.
+        apart: (Q, 2) int64, pairs of the D masks that show different leaves, as the user says; None: none do.
         drawn: V views of the proposals alone, where they were drawn before.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
@@ -125,7 +127,13 @@ def choose_leaves(
         own = is_made[each.rows]
         usable[each.rows] &= own | ~each.is_shared[:, own].any(1)
     chosen = choose(
-        candidates, table, drawn=views, usable=usable, statements=statements, min_probability=min_probability
+        candidates,
+        table,
+        drawn=views,
+        usable=usable,
+        statements=statements,
+        apart=None if apart is None else row_of[apart].numpy(),
+        min_probability=min_probability,
     )
     return _make_leaves(chosen, candidates, table, is_held=statements.is_sure)
 

@@ -187,7 +187,8 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
     """Add the masks that the other views show of a leaf."""
     ids, parts = masks.instance_ids.clone(), {}
     for view, (visible, leaf_colored) in _find_open(masks, leaf, surface, cameras=cameras, colored=colored).items():
-        free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
+        is_free = (ids < 0) & ~masks.is_corrected & ~masks.is_linked  # a linked one does not show the leaf
+        free = ((masks.view_index == view) & is_free).nonzero()[:, 0].tolist()
         fits = {row: masks.regions.placed(row).iou(visible) for row in free}
         best = max(fits, key=lambda row: fits[row], default=-1)
         if best >= 0 and fits[best] >= EVIDENCE.fits:
@@ -225,8 +226,8 @@ def _find_open(
 
 
 def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
-    """(H, W) bool: what masks of other instances, or that the user drew, show."""
-    is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected)
+    """(H, W) bool: masks of other instances, and masks without one that edits are about."""
+    is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected | masks.is_linked)
     width, height = cameras.sizes[view].tolist()
     return masks.regions.label_map(view, is_other.long(), (width, height)) > 0
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
@@ -94,6 +95,17 @@ def thin_views(
         views.append((thin, rows, step))
         counts += count_colors(views[-1][0], is_leaf[views[-1][1]])
     return views, leaf_colors(counts)
+
+
+def colored_shares(masks: Masks, photos: ReadPhoto, colors: NDArray[np.bool_]) -> torch.Tensor:
+    """(D,) float64: share of each mask that has one of the `leaf_colors`."""
+    shares = torch.zeros(len(masks), dtype=torch.float64)
+    for view in masks.view_index.unique().tolist():
+        is_colored = torch.from_numpy(has_leaf_color(photos(view), colors))
+        for row in (masks.view_index == view).nonzero()[:, 0].tolist():
+            mask = masks.regions.placed(row)
+            shares[row] = (mask.pixels & mask.cut(is_colored)).sum() / mask.area
+    return shares
 
 
 def colors_of_leaves(masks: Masks, photos: ReadPhoto) -> NDArray[np.bool_]:

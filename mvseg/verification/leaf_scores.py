@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 import torch
 from scipy.special import expit, logit
+from torch import Tensor
 
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -29,23 +30,19 @@ class LeafScores:
         matched: the same for a candidate without one: see `matched_features`.
         leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
         leaf_matched: the same for a candidate without one, by the first four of these features.
-        finer: log odds that a mask shows a candidate gain per logarithm of `Masks.resolution`.
     """
 
     shows: dict[str, float]
     matched: dict[str, float]
     leaf: dict[str, float]
     leaf_matched: dict[str, float]
-    finer: float
 
 
-# Chosen, the last one: of 0.5, 1 and 2, with which proposals of two passes are one set (docs/notes/detector.md).
 FITTED = LeafScores(
     shows={"always": 0.656, "detection score": 0.314, "claimed": 1.431, "visible": 0.665},
     matched={"always": -1.632, "detection score": 0.958, "match score": 0.897},
     leaf={"always": -2.385, "shown": 4.382, "number": 0.913, "detection score": 1.153, "length": 1.157, "fit": 0.387},
     leaf_matched={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
-    finer=1.0,
 )
 
 
@@ -110,29 +107,20 @@ class ClearLeaves:
 
 
 def show_chances(
-    candidates: Candidates, evidence: Evidence, scores: Floats, resolution: Floats, fitted: LeafScores = FITTED
+    candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED
 ) -> Floats:
-    """(D, K) q: how likely each mask shows each candidate, from the detection scores and `Masks.resolution` (D,).
-    Without a surface, only the masks that were matched to a candidate can; what the user says is certain."""
-    bonus = fitted.finer * finer(resolution)[:, None]
-    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()) + bonus)
+    """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
+    masks that were matched to a candidate can; what the user says is certain."""
+    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
     q = np.where(np.isnan(candidates.matched), 0.0, q)
     with_surface = candidates.has_surface
     if with_surface.any():
-        odds = shows_features(evidence, scores) @ list(fitted.shows.values()) + bonus
+        odds = shows_features(evidence, scores) @ list(fitted.shows.values())
         by_surface = expit(odds) * (evidence.claimed > 0)
         q = np.where(with_surface, by_surface, q)
     q[candidates.certain.any(1)] = 0
     q[candidates.certain] = 1
     return q
-
-
-def finer(resolution: Floats) -> Floats:
-    """(D,) logarithm of the resolution over the median of all masks that have one; 0 for the others. A coarse mask must
-    not take the place of a fine one."""
-    logs = np.log(np.maximum(resolution, 1.0))
-    known = np.isfinite(logs)
-    return np.where(known, logs - np.median(logs[known]), 0.0) if known.any() else np.zeros(len(logs))
 
 
 def shows_features(evidence: Evidence, scores: Floats) -> Floats:
@@ -194,19 +182,38 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
     return best, row
 
 
-def rate_pass(masks: Masks, probabilities: Mapping[int, float], *, pixel: float) -> float:
-    """Agreed area of a pass, in pixels: the expected area of the correct masks, within a rim of one pixel of the
+@dataclass(frozen=True)
+class Rating:
+    """Score of a pass, to compare passes over the same photos of one plant.
+
+    Attributes:
+        agreed_area: pixels, see `rate_pass`.
+        expected: expected number of correct masks, E.
+        num_leaves: accepted leaves.
+    """
+
+    agreed_area: float
+    expected: float
+    num_leaves: int
+
+
+def rate_pass(
+    masks: Masks, probabilities: Mapping[int, float], *, pixel: float, colored: Tensor | None = None
+) -> Rating:
+    """Rate a pass by its agreed area: the expected area of the correct masks, within a rim of one pixel of the
     detector, times the expected number of correct masks of a leaf, as a share of the views.
 
     For one plant and the same views it orders sizes and weights nearly as the truth does (docs/notes/detector.md). The
     number of correct masks alone does not: a leaf in halves has twice as many. Halves mix their ids, so that each has
-    masks in fewer views.
+    masks in fewer views. Pixels without leaf colour count against a mask: all views agree about a plant with its wall,
+    too.
 
     Args:
         masks: D masks with ids whose match scores are q.
         probabilities: {instance id: P}.
         pixel: width of a pixel of the detector, in pixels of the photos. Where it is large, edges are coarse, and views
             agree for that alone.
+        colored: (D,) share of each mask that has leaf colour, see `colored_shares`; None: all of it.
     """
     num_leaves = len(masks.instance_ids[masks.instance_ids > 0].unique())
     chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
@@ -214,9 +221,23 @@ def rate_pass(masks: Masks, probabilities: Mapping[int, float], *, pixel: float)
         chances[instance] = chance
     is_correct = chances[masks.instance_ids.clamp(min=0).cpu()] * masks.match_scores.cpu().double()
     within = (masks.regions.areas.cpu().double().sqrt() - 2 * pixel).clamp(min=0).square()
-    area = float((is_correct * within).sum())
-    share = float(is_correct.sum()) / max(num_leaves * masks.regions.num_views, 1)
-    return round(area * share, CHOICE.digits)
+    net = within if colored is None else within * (2 * colored - 1)
+    expected = float(is_correct.sum())
+    area = float((is_correct * net).sum().clamp(min=0)) * expected / max(num_leaves * masks.regions.num_views, 1)
+    return Rating(round(area, CHOICE.digits), round(expected, CHOICE.digits), num_leaves)
+
+
+def order_ratings(ratings: Sequence[Rating]) -> list[int]:
+    """Indices of ratings, the best one first: by the agreed area; of equals, the first.
+
+    The area alone has a degenerate optimum: the whole plant as one leaf. So passes with too few leaves
+    (`CHOICE.least_leaves`) or too few correct masks (`CHOICE.least_expected`) come last.
+    """
+    most = max((each.expected for each in ratings), default=0.0)
+    is_answer = [
+        each.num_leaves >= CHOICE.least_leaves and each.expected >= CHOICE.least_expected * most for each in ratings
+    ]
+    return sorted(range(len(ratings)), key=lambda index: (not is_answer[index], -ratings[index].agreed_area))
 
 
 def log_odds(values: Floats) -> Floats:

@@ -56,6 +56,8 @@ class ChoiceNumbers:
     least_distance: float = 0.01  # limit: distance of shares and scores from 0 and 1, where log odds are infinite
     least_q: float = 0.2  # chosen: q from which a mask may show a leaf
     least_views: int = 2  # definition: min. views in which a leaf has masks; one view alone is no agreement
+    least_leaves: int = 3  # chosen: fewer say too little of a plant, to choose a size by or to learn from
+    least_expected: float = 0.33  # chosen: min. expected correct masks of a pass, relative to the pass with most
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
 
 

@@ -187,3 +187,26 @@ def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.Mo
     for name in ("instance_ids", "match_scores", "origin"):
         assert torch.equal(getattr(found.masks, name), getattr(expected.masks, name))
     assert torch.equal(found.masks.regions.crops, expected.masks.regions.crops)
+
+
+@pytest.mark.parametrize("leaf", [1, 2])
+def test_two_masks_that_a_person_keeps_apart_never_have_one_id(monkeypatch: pytest.MonkeyPatch, leaf: int) -> None:
+    """Although a candidate from before the edit holds both, and they are all that it has."""
+    stays = (leaf != IDS) | torch.isin(REGIONS.view_index, torch.tensor([0, 3]))
+    few = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9)).select(stays)
+    ids, few = IDS[stays], replace(few, regions=replace(few.regions, labels=torch.arange(len(few))))
+    see_masks(monkeypatch, FoundMasks(Matching(few.select(ids != WEAK), MatchReport("nview")), few, more=few))
+
+    def fit_few(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:
+        matched = masks.instance_ids
+        instances = matched[matched > 0].unique().tolist()
+        return {each: LEAVES[int(ids[masks.regions.labels[matched == each]].mode().values)] for each in instances}
+
+    monkeypatch.setattr(choosing, "fit_roughly", fit_few)
+    together, apart = run(), run(Link(op="different", at=(("v0", *at(leaf, 0)), ("v3", *at(leaf, 3)))))
+    assert [each.fate for each in apart.edits] == [APPLIED]
+    for state, most in ((together, 2), (apart, 1)):
+        of_leaf = state.masks.instance_ids[ids[state.masks.regions.labels] == leaf]
+        counts = of_leaf[of_leaf > 0].bincount()
+        assert int(counts.max() if len(counts) else 0) <= most
+        assert state is apart or int(counts.max()) == 2

@@ -16,14 +16,13 @@ from mvseg import demo_scene, load_scene
 from mvseg.config import RunConfig
 from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import find_leaves, join_passes
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
-from mvseg.verification.leaf_scores import rate_pass
+from mvseg.verification.leaf_scores import Rating, order_ratings, rate_pass
 from warned import warns_of
 
 
@@ -40,9 +39,13 @@ def look_of(masks: Masks, longest: int = 32) -> Any:
     return replace(FoundMasks.of(Matching(masks, MatchReport("none"))), longest=longest)
 
 
-def expecting(right: float, longest: int = 800, agreement: float = 0.9) -> Any:
-    leaves = SimpleNamespace(agreement=agreement)
-    return SimpleNamespace(agreed_area=right, leaves=leaves, passes=(SimpleNamespace(longest=longest),))
+def expecting(
+    area: float, longest: int = 800, agreement: float = 0.9, *, leaves: int = 9, expected: float = 60.0
+) -> Any:
+    rating = Rating(area, expected, leaves)
+    return SimpleNamespace(
+        rating=rating, leaves=SimpleNamespace(agreement=agreement), passes=(SimpleNamespace(longest=longest),)
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,30 +104,39 @@ def test_the_sizes_next_to_the_one_that_was_learned(
 
 
 def test_the_agreed_area_of_whole_leaves_is_larger_than_that_of_halves() -> None:
+    def area_of(masks: Masks, probabilities: dict[int, float], pixel: float = 0, **colored: torch.Tensor) -> float:
+        return rate_pass(masks, probabilities, pixel=pixel, **colored).agreed_area
+
     labels = np.zeros((60, 60), np.int64)
     labels[:40, :20] = 1
     halves = np.where(labels, 1 + (np.arange(60)[:, None] >= 20), 0)
     q = torch.full((4,), 0.5)
     whole = Masks.of(as_regions([labels] * 4)[0], torch.ones(4, dtype=torch.int64), q)
-    assert rate_pass(whole, {1: 0.8}, pixel=0) == pytest.approx(0.4 * 4 * 800 * 0.4)
-    assert rate_pass(whole, {}, pixel=0) == rate_pass(whole.select(torch.arange(0)), {1: 1.0}, pixel=0) == 0
-    assert rate_pass(whole, {1: 0.8}, pixel=2) == pytest.approx(0.4 * 4 * (800**0.5 - 4) ** 2 * 0.4)
+    assert area_of(whole, {1: 0.8}) == pytest.approx(0.4 * 4 * 800 * 0.4)
+    assert area_of(whole, {}) == area_of(whole.select(torch.arange(0)), {1: 1.0}) == 0
+    assert area_of(whole, {1: 0.8}, pixel=2) == pytest.approx(0.4 * 4 * (800**0.5 - 4) ** 2 * 0.4)
     regions = as_regions([halves] * 4)[0]
     sure = Masks.of(regions, regions.labels, torch.ones(8))
-    assert rate_pass(sure, {1: 1.0, 2: 1.0}, pixel=0) == 4 * rate_pass(whole, {1: 1.0}, pixel=0)  # in every photo
+    assert area_of(sure, {1: 1.0, 2: 1.0}) == 4 * area_of(whole, {1: 1.0})  # in every photo
     mixed = sure.select((sure.view_index < 2) == (sure.instance_ids == 1))  # in half of the photos
-    assert rate_pass(mixed, {1: 1.0, 2: 1.0}, pixel=0) == rate_pass(sure, {1: 1.0, 2: 1.0}, pixel=0) / 4
+    assert area_of(mixed, {1: 1.0, 2: 1.0}) == area_of(sure, {1: 1.0, 2: 1.0}) / 4
+    half_green = torch.tensor([1.0, 1.0, 0.5, 0.5])  # what is not leaf-coloured counts against a mask
+    assert area_of(whole, {1: 1.0}, colored=half_green) == area_of(whole, {1: 1.0}) / 2
+    assert area_of(whole, {1: 1.0}, colored=torch.zeros(4)) == 0
 
 
-def test_what_two_passes_propose_is_one_set() -> None:
-    """The labels of all matchings are rows of it; the resolution is that of the pass."""
-    cameras = load_scene(demo_scene()).cameras
-    both = join_passes(*(find_leaves(look_of(squares(9, side=side), 640 // of), cameras)
-                         for side, of in ((40, 10), (20, 2))), cameras)  # fmt: skip
-    assert both.proposals.resolution.tolist() == pytest.approx([4.0] * 9 + [10.0] * 9)
-    assert [int(each.regions.labels.min()) for each in both.matched] == [0, 0, 9, 9]
-    for each in both.matched:
-        assert torch.equal(each.regions.areas, both.proposals.regions.areas[each.regions.labels])
+def test_the_whole_plant_as_one_leaf_wins_nowhere() -> None:
+    """As on a real muskmelon at 50 px, and on a croton, with a piece of the wall: all views agree."""
+    right, blob = Rating(1.1e6, 157.0, 9), Rating(4.3e6, 20.0, 1)
+    assert order_ratings([right, blob]) == [0, 1]
+    assert order_ratings([blob, right]) == [1, 0]
+    assert order_ratings([right, Rating(9.6e6, 37.0, 4)]) == [0, 1]  # too few masks
+    assert order_ratings([right, Rating(1.2e6, 60.0, 5)]) == [1, 0]
+    assert order_ratings([right, right]) == [0, 1]
+    assert order_ratings([Rating(0, 0, 0), Rating(0, 0, 0)]) == [0, 1]
+    found = {size: expecting(1.2, size) for size in (566, 400, 283, 200, 141, 100)}
+    found |= {size: expecting(4.0, size, leaves=1, expected=6.0) for size in (71, 50, 35)}
+    assert choose_size(found.__getitem__, expecting(1.0, agreement=0.5))[0] is found[566]
 
 
 @pytest.mark.parametrize("size", [None, 300])
@@ -160,7 +172,6 @@ def test_a_part_of_many_photos_chooses_the_size(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr("mvseg.pipeline.find_in_photos.detect_scene", detect)
     monkeypatch.setattr("mvseg.pipeline.find_in_photos.DETECTION", replace(DETECTION, judging_views=4))
     known = find_in_photos(open_photos(load_scene(demo_scene())))
-    some, every = (4, 9) if is_cropped else (None, None)
-    last = [(9, 32, every)] if near else []
-    assert asked == [(4, None, None), (4, 45, some), (4, 32, some), (9, 45, every), *last]
+    last = [(9, 32, 9)] if near else []
+    assert asked == [(4, None, None), (4, 45, 4), (4, 32, 4), (9, 45, 9), *last]  # the parts are chosen once
     assert (known.masks.regions.num_views, known.image_size) == (9, 32 if near else 45)

@@ -68,6 +68,17 @@ def test_masks_without_a_common_point_have_no_hull() -> None:
     assert len(carve_hull(stack_masks(masks, [NOTHING] * 2, range(2), px_from_world=matrices)).voxels) == 0
 
 
+def test_a_thin_mask_beside_large_ones_keeps_pixels() -> None:
+    """Pixels are made larger for the others: without any, the mask has no middle."""
+    masks = [np.zeros((900, 900), bool) for _ in range(3)]
+    masks[0][100:800, 100:800] = masks[1][100:800, 100:800] = masks[2][400, 300:600] = True
+    nothing = [np.zeros(mask.shape, np.int32) for mask in masks]
+    made = stack_masks(masks, nothing, range(3), px_from_world=ring_cameras(3).px_from_world.numpy())
+    assert made.pixel_size > 2
+    assert made.inside.any((1, 2)).all()
+    carve_hull(made)
+
+
 def test_larger_photos_give_the_same_masks() -> None:
     small, large = stack(4), stack(4, times=5)
     assert small.pixel_size == 1

@@ -19,7 +19,7 @@ from mvseg.scene import Cameras
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Leaves, add_beside, choose_leaves, gather_candidates
 from mvseg.verification.evidence import draw_views
-from mvseg.verification.leaf_scores import Candidates, finer, leaf_features
+from mvseg.verification.leaf_scores import Candidates, leaf_features
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -403,10 +403,3 @@ def test_a_mask_may_show_a_leaf_by_less_than_half_a_chance() -> None:
     q = np.where(is_leaf, np.where(is_likelier, 0.25, 0.17), 0)[:, None]
     leaf, _ = assign_masks(q, draw_views(REGIONS, [None], CAMERAS))
     np.testing.assert_array_equal(leaf, np.where(is_leaf & is_likelier, 0, -1))
-
-
-def test_finer_masks_are_likelier_at_any_scale() -> None:
-    resolution = np.array([10.0, 20.0, np.nan, 40.0])
-    assert finer(resolution) == pytest.approx([-np.log(2), 0, 0, np.log(2)])
-    assert finer(3 * resolution) == pytest.approx(finer(resolution))
-    assert not finer(np.full(3, np.nan)).any()

@@ -73,13 +73,18 @@ def test_the_other_views_show_it(
     assert np.median(ious) > 0.85
 
 
-def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(plant: tuple[Scene, Regions], photos: ReadPhoto) -> None:
+@pytest.mark.parametrize("is_linked", [False, True])
+def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(
+    plant: tuple[Scene, Regions], photos: ReadPhoto, is_linked: bool
+) -> None:
+    """Unless an edit says that it shows another one: then nothing is laid over it, either."""
     scene, truth = plant
     masks = drawn(truth, 10, (4, 8))
     lost = truth.select((truth.labels == 10) & (truth.view_index == 2))
-    both = Masks.concatenate((masks, Masks.of(lost)))
+    other = replace(Masks.of(lost), is_linked=torch.tensor([is_linked]))
+    both = Masks.concatenate((masks, other))
     after, _ = follow_drawn(both, cameras=scene.cameras, photos=photos)
-    assert after.instance_ids[len(masks)] == 10
+    assert after.instance_ids[len(masks)] == (-1 if is_linked else 10)
     assert after.origin[len(masks)] == Origin.GIVEN
     assert 2 not in after.view_index[len(both) :].tolist()
 

@@ -204,7 +204,7 @@ def stack_masks(
         own_part = _cut(mask, (x, y), (columns * scale, rows * scale), beyond=0).astype(np.float32)
         share = cv2.resize(own_part, (columns, rows), interpolation=cv2.INTER_AREA)
         cv2.GaussianBlur(share, (0, 0), STACK.blur_px, dst=blurred[index])
-        inside[index] = share >= 0.5
+        inside[index] = share >= min(0.5, share.max())  # a thin mask keeps its fullest pixels
         hiding[index] = np.where(inside[index] | (around == own), 0, around)
         matrix = px_from_world[index]
         matrix[:2] = (matrix[:2] - np.array([[x + left], [y + top]]) * matrix[2]) / scale
