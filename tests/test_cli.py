@@ -25,6 +25,7 @@ import mvseg
 from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
+from mvseg.detection.cached_detections import SCENE_FILE
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning, warn
 from mvseg.findings.finding import Finding
@@ -40,6 +41,7 @@ NAN = float("nan")
 # for tests that look at no shape and at no page
 COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--report", "false"]
 SMALL = ["--detect.image_size", "128"]  # for those that look at no detection: one size, and as large as the photos are
+WEIGHTS = str(ROOT / "models" / "leaf-lite" / "weights.safetensors")
 Break = Callable[[Path], None]
 
 
@@ -313,6 +315,7 @@ def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
     kept, said = tmp_path / "out.detections", "mvseg: going on from the detections in"
     kept.mkdir()
     (kept / f"{'0' * 64}.safetensors").touch()
+    (kept / SCENE_FILE).write_bytes(os.fsencode(os.path.realpath(plant)))
     for holds_some in (True, False):
         assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *unverified]) == 0
         assert (f"{said} {kept}, for equal photos and options" in capsys.readouterr().err) == holds_some
@@ -850,6 +853,21 @@ def test_detect_options_beside_masks_are_warned_of(
     assert "the detect options have no effect" in capsys.readouterr().err
     findings = json.loads((tmp_path / "out" / "run.json").read_text())["findings"]
     assert "detect_options_unused" in [each["code"] for each in findings]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--detect.weights", WEIGHTS], ["--detect.image_size", "300"], ["--detect.crop", "off"], ["--learn", "2"],
+        ["--detect.verify", "false"], ["--detect.weights", WEIGHTS, "--learn", "off"],
+    ],
+    ids=lambda words: " ".join(words[::2]),
+)  # fmt: skip
+def test_options_that_do_not_apply_lose_no_run(plant: Path, tmp_path: Path, words: list[str]) -> None:
+    """A file of weights beside masks, and so on: everything is written, as without them."""
+    out = tmp_path / "out"
+    assert main(["infer", str(plant), "--masks", "masks", "--out", str(out), "--quiet", *COARSE, *words]) == 0
+    assert not {"detect", "learn"} & json.loads((out / "run.json").read_text())["config"].keys()
 
 
 def test_a_repeated_warning_is_given_once(

@@ -28,6 +28,7 @@ from mvseg.corrections.file import FORMAT, Corrections, Outline, Reject, load_co
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.corrections.unchanged_leaves import name_regions
+from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
@@ -50,6 +51,7 @@ from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, as_sentence, keep_numbers, open_alone
 from mvseg.server.saved_edits import CHANGED
+from mvseg.system.file_hash import hash_files
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
@@ -741,12 +743,34 @@ def test_a_strangers_result_makes_nobody_read_other_files(tmp_path: Path) -> Non
     run["inputs"] |= {str(path): "0" for path in ("/dev/zero", tmp_path / "pipe", tmp_path / "private.txt", "/")}
     run["photo_sha256"] |= {"../../private.txt": "0", "/dev/zero": "0"}
     (out / "run.json").write_text(json.dumps(run))
+    inside = tmp_path / "balls" / "private"  # of the scene, too
+    inside.mkdir()
+    os.mkfifo(inside / "pipe")
+    run["inputs"] |= {str(inside): "0"}
+    (out / "run.json").write_text(json.dumps(run))
     changes = read_recorded(out).changes
+    assert Finding("input_not_read", str(inside)) in changes
     assert Finding("input_not_read", str(tmp_path / "private.txt")) in changes
     assert Finding("input_not_read", "/") in changes
     assert Finding("input_gone", "/dev/zero") in changes
     (gone,) = [each for each in changes if each.code == "photos_gone"]
     assert (gone.values["count"], gone.values["total"]) == (2, 6)
+    run["config"] |= {"scene": "/proc", "from_here": {}}
+    (out / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError, match="/proc: is no scene any more"):
+        read_recorded(out)
+
+
+def test_weights_that_ship_may_lie_elsewhere(tmp_path: Path) -> None:
+    """A result of another installation of the same version; other weights count as a change."""
+    scene, out = write_scene(tmp_path / "balls"), tmp_path / "out"
+    run_one_scene(RunRequest(scene, Path("masks"), out, RunConfig(reconstruct=None)))
+    run = json.loads((out / "run.json").read_text())
+    run["config"]["detect"] = {"weights": "leaf-lite"}
+    for sha256, codes in ((hash_files(weights_path("leaf-lite")), []), ("0" * 64, ["input_gone"])):
+        changed = run | {"inputs": run["inputs"] | {"/elsewhere/weights.safetensors": sha256}}
+        (out / "run.json").write_text(json.dumps(changed))
+        assert [each.code for each in read_recorded(out).changes] == codes
 
 
 def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:

@@ -15,6 +15,7 @@ from mvseg import Corrections, InputError, ReconstructConfig, RunConfig, run_sce
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.pipeline.open_scene import open_scene
+from mvseg.reconstruction.spread_views import find_repeated
 from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
 from warned import warns_of
@@ -48,6 +49,24 @@ def with_views(folder: Path, copy: Path, views: list[int]) -> Path:
 def rejects(*views: str) -> Corrections:
     edits = [{"op": "reject", "view": view, "at": [1, 1]} for view in views]
     return parse_corrections({"format": FORMAT, "edits": edits})
+
+
+def test_views_of_one_place_count_once(plant: Path, tmp_path: Path) -> None:
+    """Of a burst, or of a film with equal frames; given masks keep their ids in all views."""
+    twice = tmp_path / "twice"
+    shutil.copytree(plant, twice)
+    rig = json.loads((twice / "cameras.json").read_text())
+    for view in [*rig["views"]]:
+        copy = view["file"].replace("images/", "images/again-")
+        shutil.copy(twice / view["file"], twice / copy)
+        rig["views"].append(view | {"file": copy})
+    (twice / "cameras.json").write_text(json.dumps(rig))
+    with warns_of("views_repeated"):
+        opened = open_scene(twice, None, replace(IDS_ONLY, views="all"))
+    assert [view.name for view in opened.scene.views] == [f"{view:03d}" for view in range(9)]
+    assert len(opened.views_left_out) == 9
+    assert not find_repeated(opened.scene.cameras).any()
+    assert len(open_scene(plant, plant / "masks", IDS_ONLY).scene.views) == 9
 
 
 def test_it_is_the_run_of_a_scene_without_the_other_views(plant: Path, tmp_path: Path) -> None:

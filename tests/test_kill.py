@@ -133,7 +133,7 @@ def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: 
             (place / "notes.txt").write_text("three leaves")
         has_earlier = place.exists()
         runs(run, signal, delay)
-        sweep_abandoned(place)  # as whatever reads the result does
+        sweep_abandoned(place)  # as whatever writes there does
         if has_earlier:
             assert (place / "notes.txt").read_text() == "three leaves"
         if has_earlier or place.exists():

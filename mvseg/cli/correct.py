@@ -33,10 +33,12 @@ def run(args: Namespace) -> int:
     from mvseg.server.open_result import OpenResult, check_writable, open_alone
     from mvseg.server.open_tracks import OpenTracks
     from mvseg.server.saved_edits import CORRECTIONS_FILE
+    from mvseg.system.atomic import sweep_abandoned
     from mvseg.system.running import running
     from mvseg.system.worker_pool import default_workers, load_ahead
     from mvseg.tracking.recorded import is_tracks
 
+    sweep_abandoned(args.result)
     has_tracks = is_tracks(args.result)
     folder = args.result if has_tracks else find_result(args.result)
     if not folder.is_dir():

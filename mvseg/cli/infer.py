@@ -66,6 +66,7 @@ def run(args: Namespace) -> int:
 def _request_again(args: Namespace) -> RunRequest:
     from mvseg.results.read import find_result
     from mvseg.runs.request import repeat_run
+    from mvseg.system.atomic import sweep_abandoned
 
     learn = build_run(args).learn
     if args.scene is not None or args.masks is not None or build_run(args) != RunConfig(learn=learn):
@@ -74,6 +75,7 @@ def _request_again(args: Namespace) -> RunRequest:
             "options than --learn, --detector, --corrections, --force_corrections, --out, --overwrite, --num_workers "
             "and --quiet"
         )
+    sweep_abandoned(args.again)
     request = repeat_run(
         find_result(args.again),
         out=args.out,

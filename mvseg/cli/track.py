@@ -74,11 +74,13 @@ def run(args: Namespace) -> int:
 
 def _read_again(args: Namespace) -> RecordedTracks:
     """The run that --again names."""
+    from mvseg.system.atomic import sweep_abandoned
     from mvseg.tracking.recorded import read_recorded_tracks
 
     if args.results or args.times or args.plant or args.pots != "auto":
         message = f"--again repeats the run of {args.again} with its results, times and pots"
         raise InputError(f"{message}, expected no others")
+    sweep_abandoned(args.again)
     found = read_recorded_tracks(args.again)
     return replace(found, folder=args.out or args.again)
 

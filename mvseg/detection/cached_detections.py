@@ -113,6 +113,9 @@ def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterat
             try:
                 owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
                 earlier = owner.read_bytes() if owner.is_file() else place
+                if not owner.is_file() and _holds_some(folder) and not overwrite:
+                    message = "holds detections, but not of which photos, expected another --out, or --overwrite true"
+                    raise InputError(f"{folder}: {message}")
                 if earlier != place and not overwrite:
                     message = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}, not of"
                     raise InputError(f"{folder}: {message} {scene}; expected another --out, or --overwrite true")

@@ -36,6 +36,7 @@ from mvseg.formats.heic import SUFFIXES as HEIC_SUFFIXES
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIC_SUFFIXES)
 MAX_SIDE = 1 << 20  # limit: pixels
 MAX_PIXELS = 1 << 28  # limit: more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
+PIXEL_BYTES, MARGIN_BYTES = 16, 1 << 26  # limit: of a file, per pixel, and of its other parts
 GREY = 2  # chosen: largest difference between the channels of a grey photo
 ORIENTATION = 0x0112  # definition: EXIF tag, and TIFF's
 BACK = {6: 8, 8: 6}  # the orientation that undoes another; the others undo themselves
@@ -79,8 +80,12 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
             The message is a reason, without the file's name.
     """
     with _any_fault():
+        with path.open("rb") as file:
+            reader = _find_reader(file.read(16))
+        most = MARGIN_BYTES + PIXEL_BYTES * (MAX_PIXELS if size is None else size[0] * size[1])
+        if path.stat().st_size > most:
+            raise InputError(f"it is a file of {path.stat().st_size} bytes, expected at most {most}")
         data = path.read_bytes()
-        reader = _find_reader(data)
         if reader is PngImageFile and not _has_sound_chunks(data):
             raise InputError("it is cut short, or a checksum is wrong")
         image = reader(BytesIO(data))

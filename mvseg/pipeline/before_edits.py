@@ -7,6 +7,7 @@ It holds only where all that it follows from is the same: the version of mvseg a
 from __future__ import annotations
 
 import io
+import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -73,6 +74,9 @@ def unpack_plant(content: bytes, opened: Opened) -> tuple[Plant, list[Finding]] 
         inflated = zlib.decompressobj().decompress(content, MOST_BYTES + 1)
         if len(inflated) > MOST_BYTES:
             return None
+        with zipfile.ZipFile(io.BytesIO(inflated)) as inner:  # whose records torch never compresses
+            if sum(each.file_size for each in inner.infolist()) > MOST_BYTES:
+                return None
         with torch.serialization.safe_globals(CLASSES):
             packed = torch.load(io.BytesIO(inflated), map_location="cpu", weights_only=True)
         if packed["views"] != opened.names:

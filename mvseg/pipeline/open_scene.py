@@ -24,7 +24,7 @@ from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.masks import Masks
 from mvseg.matching.match import check_baselines, find_disagreement
 from mvseg.matching.result import Matching
-from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.spread_views import find_repeated, spread_views
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
@@ -99,7 +99,7 @@ def open_scene(
         inputs = before | ({} if loaded.source is None else {loaded.source: hash_files(loaded.source)})
         photos = Photos(loaded)
         whole = place_scene(loaded, photos, scale=config.scale, unit=config.unit, up=config.up)
-        taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections)
+        taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections, once=masks is None)
         scene = whole.select(taken)
         left_out = tuple(view.name for index, view in enumerate(whole.views) if index not in taken)
         check_photos(scene)
@@ -147,12 +147,19 @@ def _hash_weights(config: RunConfig) -> dict[Path, str]:
     return {path: hash_files(path)} if path.is_file() else {}
 
 
-def _take_views(scene: Scene, most: int | Literal["all"], corrections: Corrections | None) -> Tensor:
+def _take_views(
+    scene: Scene, most: int | Literal["all"], corrections: Corrections | None, *, once: bool
+) -> Tensor:
     """(S,) int64, ascending: the views that are taken, see `RunConfig.views`. Their names decide between equally good
-    choices, so that the order of the views does not matter."""
-    if most == "all":
-        return torch.arange(len(scene.views))
+    choices, so that the order of the views does not matter.
+
+    `once`: one view of those from one place, so that a burst, or two equal frames of a film, do not agree with
+    themselves. (Given masks keep their ids in all views.)
+    """
     order = torch.tensor(sorted(range(len(scene.views)), key=lambda view: natural_order(scene.views[view].name)))
-    taken = order[spread_views(scene.cameras[order], most)].tolist()
+    if once and (is_repeated := find_repeated(scene.cameras[order])).any():
+        warn(Finding("views_repeated", values={"count": int(is_repeated.sum()), "total": len(order)}))
+        order = order[~is_repeated]
+    taken = order if most == "all" else order[spread_views(scene.cameras[order], most)]
     named = [] if corrections is None else named_views(corrections, scene)
-    return torch.tensor(sorted({*taken, *named}))
+    return torch.tensor(sorted({*taken.tolist(), *named}))

@@ -171,7 +171,7 @@ def _shrink(frame: NDArray[np.uint8]) -> Grey:
 @contextmanager
 def _opened(clip: Path) -> Iterator[cv2.VideoCapture]:
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", SILENT)
-    video = cv2.VideoCapture(str(clip))
+    video = cv2.VideoCapture(str(clip.resolve()))  # a relative path may begin as a protocol does
     try:
         if not video.isOpened():
             raise InputError(f"{clip}: the video cannot be opened, expected MP4, MOV, AVI, MKV or WebM")

@@ -17,6 +17,7 @@ class RayNumbers:
     most_error: float = 0.003  # chosen: miss of a point, in widths of the photo, from which a view is left out
     least_angle: float = math.radians(1.0)  # chosen: min. angle between two rays that make a point
     same: float = math.radians(1.0)  # limit: angle between directions below which they crowd each other no more
+    repeated: float = math.radians(0.25)  # chosen: angle below which views are of one place, as those of a burst
     parallel: float = math.radians(2.0)  # chosen: RMS of axes' angles to their mean, where they meet in no point
     tie: float = 1e-6  # limit: difference of equal sums, as a share; the first one is taken
 

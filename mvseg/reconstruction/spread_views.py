@@ -6,6 +6,8 @@ distance on the unit sphere, is as small as no single exchange makes it smaller.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,6 +31,19 @@ def spread_views(cameras: Cameras, most: int) -> Tensor:
         (S,) int64, ascending.
     """
     return torch.from_numpy(spread_directions(_directions(cameras.to("cpu")), most))
+
+
+def find_repeated(cameras: Cameras) -> Tensor:
+    """(V,) bool: views from the place of an earlier one, with the same optical axis: within `RAYS.repeated` as seen
+    from what the cameras look at. None of two or fewer."""
+    is_repeated = torch.zeros(len(cameras), dtype=torch.bool)
+    if len(cameras) > 2:
+        cameras, least = cameras.to("cpu"), math.cos(RAYS.repeated)
+        ways, axes = torch.from_numpy(_directions(cameras)), cameras.R[:, 2]
+        is_same = (ways @ ways.T > least) & (axes @ axes.T > least)
+        for view in range(1, len(cameras)):
+            is_repeated[view] = (is_same[view, :view] & ~is_repeated[:view]).any()
+    return is_repeated
 
 
 def spread_directions(ways: NDArray[np.float64], most: int) -> NDArray[np.int64]:

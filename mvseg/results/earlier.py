@@ -8,18 +8,28 @@ reads is replaced.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field
 
 from mvseg.errors import InputError
-from mvseg.system.atomic import folder_whole, is_partial, list_files, resolve_place, try_writing, write_text_whole
+from mvseg.system.atomic import (
+    folder_whole,
+    is_partial,
+    list_files,
+    resolve_place,
+    try_moving,
+    try_writing,
+    write_text_whole,
+)
 from mvseg.system.file_hash import hash_files
 
 RUN_FILE, POSE_FILE = "run.json", "pose.json"
@@ -44,12 +54,14 @@ class Output:
             alone says whose it is.
         reads: what else the command reads.
         overwrite: replace another one's folder, too, or one of another kind; None: the command has no such option.
+        names: files that the command surely writes: one of the user is refused before the work.
     """
 
     kind: Kind
     of: tuple[Path, ...] = ()
     reads: tuple[Path, ...] = ()
     overwrite: bool | None = None
+    names: tuple[str, ...] = ()
 
     @property
     def run_file(self) -> str:
@@ -75,6 +87,7 @@ class _Run(BaseModel):
 
 
 RESULT = Output("result")
+NOT_OURS = "was not written by mvseg, but the new result has a file of this name: move it away"
 
 
 @contextmanager
@@ -84,7 +97,8 @@ def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[P
     At the end, `run`, as the block left it, is written to the run file with what the folder is and a list of the files.
 
     Raises:
-        InputError: see `check_out`; or a file of the user has the name of a new one. Nothing of `out` is changed.
+        InputError: see `check_out`; or a file of the user has the name of a new one: nothing of `out` is changed, and
+            the new result stays beside it.
     """
 
     def list_replaced(folder: Path) -> set[str]:
@@ -93,8 +107,10 @@ def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[P
             taken = [each for each in name.parents[:-1] if (place / each).is_symlink() or (place / each).is_file()]
             taken += [name] if name.as_posix() not in earlier and os.path.lexists(place / name) else []
             if taken:
-                message = "was not written by mvseg, but the new result has a file of this name: move it away"
-                raise InputError(f"{out / taken[0]}: {message}")
+                places = (place.with_name(f"{place.name}-{n}") for n in count(1))
+                free = next(each for each in places if not os.path.lexists(each))
+                os.replace(folder, free)
+                raise InputError(f"{out / taken[0]}: {NOT_OURS}; the new result is in {free}")
         return earlier
 
     check_out(out, output)
@@ -144,8 +160,13 @@ def check_out(out: Path, output: Output = RESULT) -> set[str]:
     for name, sha256 in files.items():
         if not (place / name).parent.resolve().is_relative_to(place) or Path(name).name in ("", ".."):
             raise InputError(f"{out / output.run_file}: lists {name}, which is not in this folder")
+        if (place / name).is_dir():
+            raise InputError(f"{out / name}: is a folder now, with a name that mvseg gave a file: move it away")
         if (place / name).is_file() and hash_files(place / name) != sha256:
             raise InputError(f"{out / name}: was changed after mvseg wrote it, move it away, or choose another folder")
+    for name in output.names:
+        if name not in replaced and os.path.lexists(place / name):
+            raise InputError(f"{out / name}: {NOT_OURS}")
     return replaced
 
 
@@ -173,9 +194,15 @@ def check_file(path: Path, sign: bytes | None) -> None:
 
 def _try_place(out: Path, place: Path) -> None:
     """Raises InputError: nothing can be written where a folder or file is to be; before the work, not after it."""
+    if not place.name:
+        raise InputError(f"{out}: cannot be replaced, expected a folder in it")
     try:
         try_writing(next(parent for parent in place.parents if parent.exists()))
+        if place.is_dir():
+            try_moving(place)
     except OSError as error:
+        if error.errno == errno.EXDEV:
+            raise InputError(f"{out}: is a disk of its own (a mount point), expected a new folder in it") from None
         raise InputError(f"{out}: the output folder is not writable ({error.strerror}: {error.filename})") from None
 
 

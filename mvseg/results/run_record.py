@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,7 +14,7 @@ from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
-from mvseg.system.atomic import sweep_abandoned
+from mvseg.system.atomic import wait_until_whole
 
 FORMAT = 2  # definition: of the folder; 1, which says no "format", was of versions before 0.2.0
 
@@ -40,7 +41,7 @@ class TraitsRecord(_Part):
     @property
     def kinds(self) -> dict[int, Any]:
         """{id of an instance that is no leaf to be measured: kind of the reason}; earlier versions counted kinds."""
-        return {int(leaf): kind for leaf, kind in self.rejected.items() if leaf.isdecimal()}
+        return {int(leaf): kind for leaf, kind in self.rejected.items() if re.fullmatch("[0-9]{1,9}", leaf)}
 
 
 class LearnedRecord(_Part):
@@ -97,7 +98,7 @@ def load_run(folder: Path) -> RunRecord:
     Raises:
         InputError: this is no result, or one of a newer format; run.json is broken.
     """
-    sweep_abandoned(folder)  # a killed run may have put some of its files there, and not yet the others
+    wait_until_whole(folder)
     path = folder / RUN_FILE
     if not path.is_file():
         raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer")

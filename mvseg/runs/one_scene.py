@@ -55,7 +55,9 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     place = resolve_place(out)
     sweep_abandoned(place)
     request = request.with_found()
-    output = Output("result", of=(request.scene,), reads=request.inputs, overwrite=request.overwrite)
+    names = ("instances.json", *((REPORT_FILE,) if request.config.report else ()))
+    names += ("scene.glb", "traits.csv", "traits_wide.csv") if request.config.reconstruct is not None else ()
+    output = Output("result", (request.scene,), request.inputs, overwrite=request.overwrite, names=names)
     check_out(out, output)
     replaces = " (in place of an earlier result)" if place.is_dir() and any(place.iterdir()) else ""
     cache, finds = place.with_name(f"{place.name}.detections"), request.masks is None
@@ -134,23 +136,28 @@ def save_scene(solved: Solved, request: RunRequest, output: Output) -> None:
 def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[str, Any]:
     """Origin of a result, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
     detector's weights, too), and the options of the stages that ran; and the findings."""
-    options = asdict(config)
-    if masks is not None:
-        del options["detect"], options["learn"]
-    if config.reconstruct is None:
-        for name in ("reconstruct", "traits", "scale", "unit", "up"):
-            del options[name]
-    elif Path(config.detect.weights).exists():  # a file of the user, whatever the working directory is
-        options["detect"]["weights"] = str(Path(config.detect.weights).resolve())
     return {
         **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
         "inputs": dict(result.inputs),
         "photo_sha256": _hash_photos(result),
-        "config": options,
+        "config": _describe_options(masks, config),
         "findings": [each.as_json() for each in result.findings],
     }
+
+
+def _describe_options(masks: Path | None, config: RunConfig) -> dict[str, Any]:
+    """The options of the stages that run."""
+    options = asdict(config)
+    if masks is not None:
+        del options["detect"], options["learn"]
+    elif Path(config.detect.weights).exists():  # a file of the user, whatever the working directory is
+        options["detect"]["weights"] = str(Path(config.detect.weights).resolve())
+    if config.reconstruct is None:
+        for name in ("reconstruct", "traits", "scale", "unit", "up"):
+            del options[name]
+    return options
 
 
 def _hash_photos(result: Result) -> dict[str, str]:

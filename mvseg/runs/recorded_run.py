@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,10 +14,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from mvseg._version import __version__, code_hash
 from mvseg.config import RunConfig
-from mvseg.errors import InputError
+from mvseg.errors import InputError, collect_warnings
 from mvseg.findings.finding import Finding
+from mvseg.formats.find_views import find_file
+from mvseg.formats.scene_folder import is_scene_folder, load_scene
 from mvseg.results.earlier import RUN_FILE, path_from
 from mvseg.results.run_record import RunRecord, find_place, load_run
+from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 
 # Options of earlier versions: what they were by default, and the finding about a result of another value.
@@ -24,8 +29,8 @@ GONE: dict[str, tuple[Any, str]] = {
     "detect.min_views": (2, "min_views_gone"),
     "refine_poses": (False, "refine_poses_gone"),
 }
-READ = ("scene", "masks", "corrections")
-PLACES = (*READ, "out")  # of run.json's config: what the run read and wrote
+PLACES = ("scene", "masks", "corrections", "out")  # of run.json's config: what the run read and wrote
+MOST_BYTES = 1 << 34  # limit: of an input that is compared: run.json may name a file without an end
 
 
 @dataclass(frozen=True)
@@ -68,8 +73,12 @@ def read_recorded(folder: Path) -> RecordedRun:
         raise InputError(f"{folder / RUN_FILE}: does not say which scene this is, expected a result of one scene")
     if not scene.exists():
         raise InputError(f"{scene}: the scene of this result is gone, expected it there")
+    if not is_scene_folder(scene):
+        raise InputError(f"{scene}: is no scene any more, expected that of the result in {folder}")
     if masks is not None and not masks.exists():
         raise InputError(f"{masks}: the masks of this result are gone, expected them there")
+    with collect_warnings():  # a run says them
+        opened = load_scene(scene)
     return RecordedRun(
         folder=folder,
         record=record,
@@ -77,7 +86,7 @@ def read_recorded(folder: Path) -> RecordedRun:
         scene=scene,
         masks=masks,
         corrections=corrections,
-        changes=tuple(_list_changes(folder, record)),
+        changes=tuple(_list_changes(folder, record, opened, [each for each in (masks, corrections) if each])),
     )
 
 
@@ -93,26 +102,29 @@ def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> s
     return shlex.join(["mvseg", verb, "--again", str(folder), "--corrections", str(corrections)])
 
 
-def _list_changes(folder: Path, record: RunRecord) -> list[Finding]:
+def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence[Path]) -> list[Finding]:
+    """Compare what the run read. Only what another run would read is opened: a result may come from anybody."""
     changes = []
     if record.code != code_hash():
         changes.append(Finding("other_version", values={"before": record.mvseg[:60], "now": __version__}))
-    config = record.config
-    named = [find_place(folder, record, Path(str(config[name]))).resolve() for name in READ if config.get(name)]
+    named, weights = [path.resolve() for path in (*given, *([] if scene.source is None else [scene.source]))], ""
     if isinstance(detect := record.config.get("detect"), dict):
         from mvseg.detectors.zoo import weights_path  # loads torchvision
 
-        with suppress(InputError):  # they are gone, which is said where they are wanted
+        with suppress(InputError, OSError):  # they are gone, which is said where they are wanted
             named.append(weights_path(str(detect.get("weights"))).resolve())
+            weights = hash_files(named[-1], most_bytes=MOST_BYTES)
     for stated, sha256 in record.inputs.items():
+        if sha256 == weights:  # wherever this version keeps them
+            continue
         path = find_place(folder, record, Path(stated))
         if not (path.is_dir() or path.is_file()):
             changes.append(Finding("input_gone", str(path)))
-        elif not any(path.resolve().is_relative_to(place) for place in named):
+        elif path.resolve() not in named:
             changes.append(Finding("input_not_read", str(path)))
-        elif hash_files(path) != sha256:
+        elif _hash(path) != sha256:
             changes.append(Finding("input_changed", str(path)))
-    changes += _list_other_photos(folder, record)
+    changes += _list_other_photos(folder, record, scene)
     before = {name: _option(record, name) for name in GONE}
     gone = [code for name, (usual, code) in GONE.items() if before[name] not in (None, usual)]
     return changes + [Finding(code, str(folder)) for code in gone]
@@ -125,23 +137,28 @@ def _option(record: RunRecord, name: str) -> Any:
     return inside.get(own) if isinstance(inside, dict) else None
 
 
-def _list_other_photos(folder: Path, record: RunRecord) -> list[Finding]:
+def _hash(path: Path) -> str:
+    """SHA-256 of an input, "" of one that has no end, or hardly."""
+    try:
+        return hash_files(path, most_bytes=MOST_BYTES)
+    except OSError:
+        return ""
+
+
+def _list_other_photos(folder: Path, record: RunRecord, scene: Scene) -> list[Finding]:
     if record.photos is None:
         return []
     place, count = find_place(folder, record, record.photos), len(record.photo_sha256)
-    gone = [name for name in record.photo_sha256 if not _is_file_below(place, name)]
+    photos = {os.path.abspath(view.path) for view in scene.views if view.path.is_file()}
+    gone = [name for name in record.photo_sha256 if os.path.abspath(find_file(place / name)) not in photos]
     others = [
-        name for name, sha256 in record.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
+        name for name, sha256 in record.photo_sha256.items() if name not in gone and _hash(place / name) != sha256
     ]
     return [
         Finding(code, str(place), {"count": len(names), "total": count, "names": tuple(names)})
         for code, names in (("photos_changed", others), ("photos_gone", gone))
         if names
     ]
-
-
-def _is_file_below(place: Path, name: str) -> bool:
-    return (place / name).is_file() and (place / name).absolute().is_relative_to(place.absolute()) and ".." not in name
 
 
 def _read_config(folder: Path, record: RunRecord) -> RunConfig:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import subprocess
 import sys
 import threading
@@ -14,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Generic, Protocol, TypeVar
 
+from mvseg._version import PACKAGE
 from mvseg.corrections.file import Corrections
 from mvseg.errors import InputError
 from mvseg.server.saved_edits import Refused, SavedEdits
@@ -27,8 +29,10 @@ LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # chosen: that learning takes on
 
 def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int, str]:
     """Run `mvseg` in a process of its own: its exit code, and the last line on its stderr."""
-    command, last_line = [sys.executable, "-m", "mvseg.cli", *words], ""
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+    command, last_line = [sys.executable, "-P", "-m", "mvseg.cli", *words], ""  # -P: nothing of the user's folder
+    place = os.pathsep.join(filter(None, (str(PACKAGE.parent), os.environ.get("PYTHONPATH"))))
+    env = os.environ | {"PYTHONPATH": place}
+    with subprocess.Popen(command, env=env, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
         for line in process.stderr or ():
             if line.strip():
                 last_line = line.strip()

@@ -30,7 +30,7 @@ from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import unpack_plant
+from mvseg.pipeline.before_edits import MOST_BYTES, unpack_plant
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.learn import learn
@@ -294,6 +294,7 @@ class OpenResult:
         """State of the run before edits; None if the result lacks it, or if something has changed since."""
         path, said = self.folder / BEFORE_EDITS_FILE, self.run.record
         is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
+        is_same = is_same and path.stat().st_size <= MOST_BYTES
         return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None
 
 

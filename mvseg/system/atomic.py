@@ -1,10 +1,12 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
-What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile. The
-files that it replaces move to `.NAME.mvseg-aside`, then it becomes `.NAME.mvseg-ready`, and its files take their
-places; everything else in NAME stays. Locks end with their process: what a killed process left is put back (no
-`.mvseg-ready` yet) or completed by the next write to NAME. On a disk without locks, two processes must not write to one
-NAME at the same time.
+What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile. Then
+all files in NAME that go, or whose names the new ones have, move to `.NAME.mvseg-aside`; `.NAME.partial` becomes
+`.NAME.mvseg-ready`, from which moment on the new files win; its files move to NAME; what was put aside is deleted, and
+`.NAME.mvseg-ready` last. Everything else in NAME stays. Locks end with their process: what a killed process left is put
+back (no `.mvseg-ready` yet) or completed by the next write to NAME. Whoever only reads NAME waits for the writer, and
+completes nothing: a folder from a stranger may have such names beside it. On a disk without locks, two processes must
+not write to one NAME at the same time.
 """
 
 from __future__ import annotations
@@ -13,9 +15,9 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, mkstemp
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -57,21 +59,60 @@ def try_writing(folder: Path) -> None:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
+def try_moving(place: Path) -> None:
+    """Move a file into a folder from beside it, as `folder_whole` will, and delete it.
+
+    Raises:
+        OSError: it cannot be moved there; EXDEV: the folder is a disk of its own.
+    """
+    handle, name = mkstemp(PARTIAL, ".", place.parent)
+    os.close(handle)
+    try:
+        os.replace(name, place / Path(name).name)
+        name = str(place / Path(name).name)
+    finally:
+        os.unlink(name)
+
+
 def is_partial(path: Path) -> bool:
     """Whether a path is an unfinished or abandoned write, or its lock."""
     return path.name.startswith(".") and path.name.endswith(LEFT)
 
 
 def sweep_abandoned(place: Path) -> None:
-    """Complete, undo or delete what killed runs left beside `place`, unless another run is writing it now.
+    """Complete, undo or delete what killed runs left beside `place`, unless another run is writing it now. For whoever
+    is about to write there; see `wait_until_whole`.
 
     Raises:
-        InputError: see `resolve_place`.
+        InputError: see `resolve_place`; or no run left what is there.
     """
     place = resolve_place(place)
-    if any(os.path.lexists(_beside(place, kind)) for kind in LEFT):
-        with suppress(InputError, OSError), _locked(_beside(place, LOCK)):  # OSError: of another user
-            _clear(place)
+    if not any(os.path.lexists(_beside(place, kind)) for kind in LEFT):
+        return
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(_locked(_beside(place, LOCK)))
+        except (InputError, OSError):  # another run's, or another user's
+            return
+        with suppress(OSError):
+            _settle(place)
+
+
+def wait_until_whole(place: Path) -> None:
+    """Wait while another run replaces the files of a folder that is to be read. Nothing is changed.
+
+    Raises:
+        InputError: see `resolve_place`; or a run was killed while it replaced them.
+    """
+    place = resolve_place(place)
+    marks = [_beside(place, kind) for kind in (ASIDE, READY)]
+    if not any(map(os.path.lexists, marks)):
+        return
+    with suppress(OSError), _locked(_beside(place, LOCK), wait=True):
+        pass
+    if any(map(os.path.lexists, marks)):
+        message = "a run was stopped while it replaced these files, expected the same run once more, which completes it"
+        raise InputError(f"{place}: {message}")
 
 
 def sweep_folder(folder: Path) -> None:
@@ -157,9 +198,11 @@ def folder_whole(place: Path, replaced: Callable[[Path], Collection[str]] = lamb
     with _writing(place) as partial:
         partial.mkdir()
         yield partial
-        names = [name for name in replaced(partial) if os.path.lexists(place / name)]
-        _move_files(names, place, _beside(place, ASIDE))
-        os.replace(partial, _beside(place, READY))  # from here on the new files win, see `_clear`
+        _sync_files(partial)
+        names = {*replaced(partial), *list_files(partial)}
+        _move_files(sorted(each for each in names if os.path.lexists(place / each)), place, _beside(place, ASIDE))
+        os.replace(partial, _beside(place, READY))  # from here on the new files win, see `_settle`
+        _sync_folder(place.parent)
 
 
 def list_files(folder: Path) -> list[str]:
@@ -169,14 +212,44 @@ def list_files(folder: Path) -> list[str]:
 
 
 def _move_files(names: Collection[str], source: Path, target: Path) -> None:
-    """Move files of a folder to the same places in another, and delete the folders that become empty by that."""
+    """Move files of a folder to the same places in another, where there are none, and delete the folders that become
+    empty by that.
+
+    Raises:
+        InputError: there is a file, or a link leads elsewhere: no run left it so.
+    """
     for name in names:
+        links = [target / each for each in Path(name).parents if (target / each).is_symlink()]
+        if links or os.path.lexists(target / name):
+            raise InputError(f"{source / name}: no run left it there, since {(links or [target / name])[0]} exists")
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         os.replace(source / name, target / name)
-    for name in names:
-        for folder in Path(name).parents[:-1]:
-            with suppress(OSError):  # it holds other files, or is gone
-                (source / folder).rmdir()
+    folders = {folder for name in names for folder in Path(name).parents}
+    for folder in folders:
+        _sync_folder(target / folder)
+    for folder in sorted(folders - {Path()}, key=lambda each: -len(each.parts)):
+        with suppress(OSError):  # it holds other files, or is gone
+            (source / folder).rmdir()
+
+
+def _sync_files(folder: Path) -> None:
+    """Let all files of a folder reach the disk."""
+    for path in (*folder.rglob("*"), folder):
+        if path.is_dir():
+            _sync_folder(path)
+        else:
+            with path.open("rb+") as file:
+                os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    """Let the names in a folder reach the disk, where systems can do this."""
+    with suppress(OSError):
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 @contextmanager
@@ -189,10 +262,10 @@ def _writing(place: Path) -> Iterator[Path]:
     try:
         with _locked(_beside(place, LOCK), wait=True):
             try:
-                _clear(place)
+                _settle(place)
                 yield _beside(place, PARTIAL)
             finally:
-                _clear(place)
+                _settle(place)
     except OSError as error:
         if error.errno is not None and (error.filename is None or is_partial(Path(str(error.filename)))):
             error.filename = str(place)
@@ -200,19 +273,49 @@ def _writing(place: Path) -> Iterator[Path]:
 
 
 def _beside(place: Path, kind: str) -> Path:
+    if not place.name:
+        raise InputError(f"{place}: cannot be replaced, expected a folder in it")
     return place.with_name(f".{place.name}{kind}")
 
 
-def _clear(place: Path) -> None:
-    """Complete, undo or delete the remains of an earlier write, under the lock."""
-    ready, aside = _beside(place, READY), _beside(place, ASIDE)
-    for waiting in [ready] if ready.is_dir() else [aside] if aside.is_dir() else []:
+def _settle(place: Path) -> None:
+    """Complete, undo or delete the remains of an earlier write, under the lock.
+
+    At every moment, what remains says which files win: `.mvseg-ready` outlives the files that were put aside.
+
+    Raises:
+        InputError: no run left what is there.
+        OSError: something cannot be moved or deleted; it stays for the next time.
+    """
+    partial, aside, ready = (_beside(place, kind) for kind in (PARTIAL, ASIDE, READY))
+    for mark in (aside, ready):
+        if mark.is_symlink() or (mark.exists() and not mark.is_dir()):
+            raise InputError(f"{mark}: is a file or a link, which no run left there; expected to find it deleted")
+    if ready.is_dir():
+        if linked := [name for name in list_files(ready) if (ready / name).is_symlink()]:
+            raise InputError(f"{ready / linked[0]}: is a link, which no run left there; expected to find it deleted")
         if os.path.lexists(place):
-            _move_files(list_files(waiting), waiting, place)
+            _move_files(list_files(ready), ready, place)
+            _delete(aside)
+            _delete(ready)
         else:
-            os.replace(waiting, place)
-    for path in (_beside(place, PARTIAL), ready, aside):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
+            _delete(aside)
+            os.replace(ready, place)
+    elif aside.is_dir():
+        if os.path.lexists(place):
+            _move_files(list_files(aside), aside, place)
+            _delete(aside)
         else:
-            path.unlink(missing_ok=True)
+            os.replace(aside, place)
+    _delete(partial)
+
+
+def _delete(path: Path) -> None:
+    """Delete a file or folder, if it exists."""
+    if not os.path.lexists(path):
+        return
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+    _sync_folder(path.parent)

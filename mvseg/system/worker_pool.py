@@ -25,6 +25,7 @@ from mvseg.system.threads import stay_on_one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
+SAFE_PATH = "PYTHONSAFEPATH"
 AHEAD = 16  # limit: items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
@@ -49,9 +50,12 @@ def start_pool(num_workers: int) -> Iterator[ProcessPoolExecutor]:
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"  # no worker imports a module of the user's folder
     try:
         yield pool
     finally:
+        os.environ.pop(SAFE_PATH) if before is None else os.environ.update({SAFE_PATH: before})
         ours.close()  # an orderly shutdown of the interpreter would take seconds
         pool.shutdown(cancel_futures=True)
 

@@ -14,6 +14,7 @@ from mvseg.corrections.track_links import LeafLink, find_links
 from mvseg.errors import InputError
 from mvseg.formats.json_file import read_json
 from mvseg.results.earlier import RUN_FILE
+from mvseg.system.atomic import wait_until_whole
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import PlantOnDate, name_apart, read_date
 
@@ -114,6 +115,7 @@ def read_recorded_tracks(folder: Path) -> RecordedTracks:
         InputError: these are no tracks, or those of a version that did not say what they were made of; a result is
             gone.
     """
+    wait_until_whole(folder)
     if not is_tracks(folder):
         raise InputError(f"{folder}: holds no tracks.csv and {RUN_FILE}, expected the output of mvseg track")
     record = read_json(folder / RUN_FILE, _Run)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -111,7 +112,12 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     code = io.BytesIO()
     torch.save({"views": opened.names, "plant": run}, code)
     bomb = zlib.compress(bytes(MOST_BYTES + 1) + content)
-    for broken in (b"", content[:-9], bomb, zlib.compress(b"text"), zlib.compress(code.getvalue())):
+    packed_twice = io.BytesIO()
+    with zipfile.ZipFile(packed_twice, "w", zipfile.ZIP_DEFLATED) as inner, inner.open("archive/data.pkl", "w") as file:
+        for _ in range(MOST_BYTES // 2**20 + 1):
+            file.write(bytes(2**20))
+    bombs = bomb, zlib.compress(packed_twice.getvalue())
+    for broken in (*bombs, b"", content[:-9], zlib.compress(b"text"), zlib.compress(code.getvalue())):
         assert unpack_plant(broken, opened) is None
 
 

@@ -108,6 +108,13 @@ class TestClaim:
             delete_cached(kept)
         assert list(tmp_path.iterdir()) == []
 
+    def test_detections_that_say_nothing_of_their_photos_are_not_taken(self, tmp_path: Path) -> None:
+        write_detections(tmp_path / "kept" / self.NAME, FOUND)
+        with pytest.raises(InputError, match="kept: holds detections, but not of which photos"):
+            claim_cache(tmp_path / "kept", tmp_path).__enter__()
+        with claim_cache(tmp_path / "kept", tmp_path, overwrite=True) as holds_some:
+            assert holds_some
+
     def test_by_one_run_at_a_time(self, tmp_path: Path) -> None:
         with claim_cache(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
             claim_cache(tmp_path / "kept", tmp_path).__enter__()

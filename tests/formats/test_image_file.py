@@ -215,6 +215,15 @@ def bomb(tmp_path: Path) -> Path:
     return path
 
 
+def test_a_photo_with_a_hole_behind_it_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "hole.png"
+    Image.new("RGB", (40, 30)).save(path)
+    with path.open("rb+") as file:
+        file.truncate(3 << 30)
+    with pytest.raises(InputError, match="it is a file of 3221225472 bytes, expected at most"):
+        read_image(path, (40, 30))
+
+
 def test_a_bomb_is_never_decoded(bomb: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(image: object) -> None:
         raise AssertionError("decoded")

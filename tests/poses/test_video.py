@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -124,6 +125,13 @@ def test_broken_videos_are_one_sentence(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "a.mp4").write_bytes(content)
     with pytest.raises(InputError, match=r"a.mp4: the video cannot be opened, expected MP4"):
         watch(tmp_path / "a.mp4")
+
+
+def test_a_name_that_begins_as_a_protocol_does(walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = f"2026-05-01T10:30{walk.suffix}"
+    shutil.copy(walk, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
+    assert len(watch(Path(name)).frames) == len(watch(walk).frames)
 
 
 def test_videos_are_files_with_their_suffixes(walk: Path, tmp_path: Path) -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import os
 import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,7 +32,7 @@ from mvseg.masks import MergedMask
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.results.earlier import RESULT, check_out, replace_result
+from mvseg.results.earlier import RESULT, Output, check_out, replace_result
 from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
@@ -497,9 +499,39 @@ class TestWholeOrNotAtAll:
         save_result(ids_only(result), out, {})
         (out / "traits.csv").write_text("mine")
         with pytest.raises(InputError, match=r"traits\.csv: was not written by mvseg, but the new result has a file"):
+            check_out(out, Output("result", names=("traits.csv",)))  # before the work
+        with pytest.raises(InputError, match=r"traits\.csv: was not written .*; the new result is in .*out-1"):
             save_result(result, out, {})
         assert (out / "traits.csv").read_text() == "mine"
-        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out-1"]
+        assert files_below(tmp_path / "out-1") == IDS_FILES | SHAPE_FILES
+
+    def test_a_folder_of_the_user_with_the_name_of_a_written_file(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(ids_only(result), out, {})
+        (out / "instances.json").unlink()
+        (out / "instances.json").mkdir()
+        (out / "instances.json" / "thesis.txt").write_text("mine")
+        with pytest.raises(InputError, match=r"instances\.json: is a folder now"):
+            save_result(result, out, {})
+        assert (out / "instances.json" / "thesis.txt").read_text() == "mine"
+
+    def test_a_disk_of_its_own_is_refused_before_the_work(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        replace, place = os.replace, tmp_path / "out"
+        place.mkdir()
+
+        def refuse(source: Any, target: Any) -> None:
+            if Path(target).is_relative_to(place):
+                raise OSError(errno.EXDEV, "Invalid cross-device link", str(source), None, str(target))
+            replace(source, target)
+
+        monkeypatch.setattr(os, "replace", refuse)
+        with pytest.raises(InputError, match=r"out: is a disk of its own \(a mount point\)"):
+            check_out(place)
+        assert list(tmp_path.iterdir()) == [place]
+        assert list(place.iterdir()) == []
 
     def test_an_empty_folder_and_a_link_to_it_are_taken(self, result: Result, tmp_path: Path) -> None:
         (tmp_path / "disk" / "out").mkdir(parents=True)

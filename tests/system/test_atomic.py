@@ -6,9 +6,13 @@ import os
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,6 +26,7 @@ from mvseg.system.atomic import (
     lock_folder,
     sweep_abandoned,
     sweep_folder,
+    wait_until_whole,
     write_text_whole,
     write_whole,
 )
@@ -205,18 +210,34 @@ def replace_files(place: Path) -> None:
         (folder / "new" / "c").write_text("2")
 
 
-def replace_files_until(place: Path, last: int) -> None:
-    """End the process, as a kill does, before the move of this number; after it, if there are fewer."""
-    replace, moves = os.replace, iter(range(100))
+CALLS = "replace", "rename", "unlink", "rmdir", "mkdir"
 
-    def move(source: Path, target: Path) -> None:
-        if next(moves) == last:
+
+def end_before(number: int) -> None:
+    """End the process, as a kill does, before the call of this number that changes a name."""
+    counter = iter(range(10_000))
+
+    def count(original: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        if next(counter) == number:
             os._exit(1)
-        replace(source, target)
+        return original(*args, **kwargs)
 
-    os.replace = move
-    replace_files(place)
-    os._exit(0)
+    for name in CALLS:
+        setattr(os, name, partial(count, getattr(os, name)))
+
+
+def run_until(number: int, work: Callable[[Path], None], place: Path) -> bool:
+    """Whether work in a process of its own was ended before the call of this number."""
+    process = os.fork()
+    if not process:
+        end_before(number)
+        work(place)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == 1
+
+
+def times_of(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if not path.name.endswith(LOCK)}
 
 
 def contents(place: Path) -> dict[str, str]:
@@ -224,27 +245,95 @@ def contents(place: Path) -> dict[str, str]:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="forks")
-def test_files_of_a_folder_are_all_old_or_all_new_wherever_a_process_is_killed(tmp_path: Path) -> None:
+def test_files_of_a_folder_are_all_old_or_all_new_wherever_a_process_is_killed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And wherever the process is killed that mends it. A reader before changes nothing, and reads all or nothing."""
     place, old, new = tmp_path / "out", {"a": "1", "old/b": "1"}, {"a": "2", "new/c": "2"}
-    found = []
-    for step in range(7):
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # for time
+    outcomes, step, again = [], 0, 0
+    while True:
         (place / "old").mkdir(parents=True, exist_ok=True)
         for name, text in {**old, "mine": "mine"}.items():
             (place / name).write_text(text)
         (place / "empty").mkdir(exist_ok=True)
-        process = os.fork()
-        if not process:
-            replace_files_until(place, step)
-        is_killed = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        is_killed = run_until(step, replace_files, place)
+        before = times_of(tmp_path)
+        with suppress(InputError):
+            wait_until_whole(place)
+            assert contents(place) in ({**old, "mine": "mine"}, {**new, "mine": "mine"})
+        assert before == times_of(tmp_path)
+        is_killed_again = run_until(again, sweep_abandoned, place)
         sweep_abandoned(place)
         left = contents(place)
         assert left.pop("mine") == "mine"
-        found.append((is_killed, left == new))
         assert left in (old, new)
         assert (place / "empty").is_dir()
         assert list(tmp_path.iterdir()) == [place]
         shutil.rmtree(place)
-    assert found == [(1, False)] * 3 + [(1, True)] * 2 + [(0, True)] * 2
+        outcomes.append((is_killed, left == new))
+        if not is_killed:
+            break
+        step, again = (step, again + 4) if is_killed_again else (step + 1, 0)
+    assert outcomes.count((True, False)) > 20
+    assert outcomes.count((True, True)) > 20
+    assert outcomes[-1] == (False, True)
+
+
+@pytest.mark.parametrize("case", ["mark is a link", "linked folder", "link within", "mark is a file"])
+def test_marks_of_a_stranger_move_nothing(tmp_path: Path, case: str) -> None:
+    """Into a folder outside, or out of one."""
+    place, mark, other = tmp_path / "out", tmp_path / ".out.mvseg-ready", tmp_path / "other"
+    for folder in (place, other):
+        folder.mkdir()
+        (folder / "keep").write_text("mine")
+    if case == "mark is a link":
+        mark.symlink_to(other)
+    elif case == "mark is a file":
+        mark.touch()
+    else:
+        (mark / "labels").mkdir(parents=True)
+        if case == "linked folder":
+            (place / "labels").symlink_to(other)
+            (mark / "labels" / "keep").write_text("theirs")
+        else:
+            (mark / "labels" / "link").symlink_to(other / "keep")
+    with pytest.raises(InputError, match="no run left"):
+        sweep_abandoned(place)
+    with pytest.raises(InputError, match="a run was stopped while it replaced these files"):
+        wait_until_whole(place)
+    assert (other / "keep").read_text() == (place / "keep").read_text() == "mine"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="forks")
+def test_a_reader_waits_for_the_writer(tmp_path: Path) -> None:
+    place = tmp_path / "out"
+    (place / "old").mkdir(parents=True)
+    (place / "a").write_text("1")
+    ready, say_ready = os.pipe()
+    process = os.fork()
+    if not process:
+        replace = os.replace
+
+        def move(source: Path, target: Path) -> None:
+            replace(source, target)
+            os.write(say_ready, b"!")
+            time.sleep(0.05)
+
+        os.replace = move
+        replace_files(place)
+        os._exit(0)
+    os.read(ready, 1)
+    wait_until_whole(place)
+    assert contents(place) == {"a": "2", "new/c": "2"}
+    os.waitpid(process, 0)
+    for handle in (ready, say_ready):
+        os.close(handle)
+
+
+def test_the_root_cannot_be_replaced() -> None:
+    with pytest.raises(InputError, match="/: cannot be replaced, expected a folder in it"):
+        folder_whole(Path("/")).__enter__()
 
 
 def test_a_file_that_another_program_has_open_leaves_all_as_it_was(
