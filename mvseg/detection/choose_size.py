@@ -17,8 +17,8 @@ from mvseg.verification.leaf_scores import order_ratings
 def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[PassResult]:
     """Look again and again at a smaller size, as long as the agreed area grows.
 
-    Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), one size without
-    growth ends nothing yet: there, agreed areas of neighbouring sizes differ by chance.
+    Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), it takes more sizes
+    without growth (`DETECTION.patience`): there, agreed areas of neighbouring sizes differ by chance.
 
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
@@ -32,7 +32,7 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
         best = order_sizes(results)[0]
         results.append(see(round(size)))
         num_misses = 0 if order_sizes(results)[0] is results[-1] else num_misses + 1
-        if num_misses > (best.leaves.agreement < DETECTION.clear_agreement):
+        if num_misses > (0 if best.leaves.agreement >= DETECTION.clear_agreement else DETECTION.patience):
             break
     return order_sizes(results)
 

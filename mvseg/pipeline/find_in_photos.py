@@ -25,6 +25,7 @@ from mvseg.reconstruction.spread_views import spread_views
 from mvseg.results.result import Instances
 from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
 from mvseg.verification.numbers import CHOICE
+from mvseg.verification.unexplained import is_familiar
 
 Colors = NDArray[np.bool_]  # of leaves, see `leaf_colors`
 
@@ -32,7 +33,8 @@ Colors = NDArray[np.bool_]  # of leaves, see `leaf_colors`
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Plant:
     """Look for leaves in the photos; the views choose leaves and masks.
 
-    The detector looks at several sizes, unless one is given: see `choose_size`. With twice as many photos as
+    The detector looks at several sizes, see `choose_size`, unless one is given, or the views clearly agree about the
+    leaves of a species that the detector knows. With twice as many photos as
     `DETECTION.judging_views`, or more, so many of them choose the size, or the two between which all photos choose. All
     sizes are of the parts of the photos that the first pass chose.
 
@@ -42,17 +44,19 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     detect = opened.config.detect
     if detect.image_size is not None or not opened.is_chosen:
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
-    few, views = _select_judges(opened)
+    few, views = select_judges(opened)
     first = run_pass(few, detect, cache=cache)
-    colors = _colors_to_judge_by(few, first)
+    colors = colors_to_judge_by(few, first)
     is_cropped = first.passes[0].boxes is not None
     boxes = first.passes[0].boxes if is_cropped else whole_photos(few.scene)
 
     def see(size: int) -> PassResult:
-        return _judge(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
+        return judge_pass(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
 
-    first = _judge(few, first, colors)
-    best = choose_size(see, first)
+    first = judge_pass(few, first, colors)
+    is_clear = first.leaves.agreement >= DETECTION.clear_agreement
+    is_known = is_clear and is_familiar(first.leaves.masks, sure_score=DETECTION.sure_score)
+    best = [first] if is_known else choose_size(see, first)
     if few is opened:
         return plant_of_pass(opened, best[0])
     boxes = whole_photos(opened.scene)
@@ -64,24 +68,24 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=boxes))
     sizes = [None if each is first else each.passes[0].longest for each in best]
     results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return plant_of_pass(opened, order_sizes([_judge(opened, each, colors) for each in results])[0])
+    return plant_of_pass(opened, order_sizes([judge_pass(opened, each, colors) for each in results])[0])
 
 
-def _colors_to_judge_by(opened: Opened, first: PassResult) -> Colors | None:
+def colors_to_judge_by(opened: Opened, first: PassResult) -> Colors | None:
     """Leaf colours of the first pass, which may miss leaves but finds little else; None where it has too few leaves."""
     masks = first.leaves.masks
     is_known = opened.photos.exist and masks.num_instances >= CHOICE.least_leaves
     return colors_of_leaves(masks, opened.photos) if is_known else None
 
 
-def _judge(opened: Opened, result: PassResult, colors: Colors | None) -> PassResult:
+def judge_pass(opened: Opened, result: PassResult, colors: Colors | None) -> PassResult:
     """The same with the share of leaf colour in each mask, by which passes are compared."""
     if colors is None:
         return result
     return replace(result, colored=colored_shares(result.leaves.masks, opened.photos, colors))
 
 
-def _select_judges(opened: Opened) -> tuple[Opened, Tensor]:
+def select_judges(opened: Opened) -> tuple[Opened, Tensor]:
     """The scene with the views that choose the size, and their indices (S,)."""
     cameras, most = opened.scene.cameras, DETECTION.judging_views
     if len(cameras) < 2 * most:
@@ -96,19 +100,19 @@ def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | No
     `DetectConfig.image_size`, where it is given."""
     opened, boxes = plant.opened, plant.boxes
     colors = plant.leaf_colors if opened.photos.exist else None
-    few, views = _select_judges(opened)
+    few, views = select_judges(opened)
     if detect.image_size is not None:
         return run_pass(opened, detect, cache=cache, boxes=boxes)
 
     def see(size: int) -> PassResult:
-        return _judge(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views]), colors)
+        return judge_pass(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views]), colors)
 
     results = choose_near(see, plant.image_size, most=plant.longest_side)
     if few is opened:
         return results[0]
     sizes = [each.passes[0].longest for each in results]
     results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return order_sizes([_judge(opened, each, colors) for each in results])[0]
+    return order_sizes([judge_pass(opened, each, colors) for each in results])[0]
 
 
 def run_pass(

@@ -1,0 +1,115 @@
+"""Does a degenerate size win? `python -m benchmarks.sizes SCENE... [--cut]`
+
+The detector looks at every size down to 32 px, and no search ends early. With --cut, once more at copies of the photos
+of which a third is cut off on each side, so that the plant fills and leaves them. For each scene a table of its sizes,
+with what decides (`order_ratings`) beside MV-PQ, edges as the detector drew them; at the end, how much of the best
+MV-PQ is lost by the best size over the whole range, and by that which `choose_size` stops at. Detections are kept in
+--cache.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.choice import true_maps
+from mvseg.config import RunConfig
+from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detection.choose_size import choose_size
+from mvseg.detection.find_leaves import PassResult
+from mvseg.detection.numbers import DETECTION
+from mvseg.errors import InputWarning
+from mvseg.evaluation.panoptic import leaf_metrics
+from mvseg.pipeline.find_in_photos import colors_to_judge_by, judge_pass, run_pass, select_judges
+from mvseg.pipeline.open_scene import open_scene
+from mvseg.pipeline.plant import whole_photos
+from mvseg.verification.leaf_scores import order_ratings
+
+
+def cut_photos(folder: Path, out: Path) -> Path:
+    """A copy of a scene with a rig file: the middle third of each photo, and of its true labels."""
+    rig = json.loads((folder / "cameras.json").read_text())
+    for place in ("images", "truth"):
+        (out / place).mkdir(parents=True, exist_ok=True)
+    for view in rig["views"]:
+        name, x, y = f"{Path(view['file']).stem}.png", view["width"] // 3, view["height"] // 3
+        for source, place in ((folder / view["file"], "images"), (folder / "truth" / name, "truth")):
+            if source.is_file():
+                image = np.asarray(cv2.imread(str(source), cv2.IMREAD_UNCHANGED))
+                cv2.imwrite(str(out / place / name), image[y : image.shape[0] - y, x : image.shape[1] - x])
+        view |= {"file": f"images/{name}", "width": view["width"] - 2 * x, "height": view["height"] - 2 * y}
+        view["K"][0][2] -= x
+        view["K"][1][2] -= y
+    (out / "cameras.json").write_text(json.dumps(rig))
+    return out
+
+
+def sweep(folder: Path, cache: Path) -> tuple[float, float]:
+    """Print the table of a scene; the loss over the whole range, and by the search, NaN without a truth."""
+    opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off"))
+    few, views = select_judges(opened)
+    truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
+    detections, detect = CachedDetections(cache), opened.config.detect
+    first = run_pass(few, detect, cache=detections)
+    boxes, colors = first.passes[0].boxes, colors_to_judge_by(few, first)
+    boxes = whole_photos(few.scene) if boxes is None else boxes
+    scores: dict[int, float] = {}
+
+    def show(result: PassResult, begun: float) -> PassResult:
+        result, masks, size = judge_pass(few, result, colors), result.leaves.masks, result.passes[0].longest
+        maps = None if truth is None else [truth[view] for view in views.tolist()]
+        scores[size] = np.nan if maps is None else leaf_metrics(masks.regions, masks.instance_ids, maps).mv_pq
+        area, seconds = result.rating.agreed_area / 1e6, time.process_time() - begun
+        cells = f"{result.rating.num_leaves} | {result.leaves.agreement:.2f} | {area:.3f}"
+        print(f"| {size} | {cells} | {result.rating.expected:.0f} | {scores[size]:.3f} | {seconds:.0f} |", flush=True)
+        return result
+
+    def see(size: int) -> PassResult:
+        begun = time.process_time()
+        return show(run_pass(few, replace(detect, image_size=size), cache=detections, boxes=boxes), begun)
+
+    print(f"\n**{folder.resolve().name}**, {len(views)} photos\n")
+    print("| px | leaves | agreement | agreed area, Mpx | E | MV-PQ | CPU s |\n" + "|---" * 7 + "|")
+    results = [show(first, time.process_time())]
+    while (size := results[0].passes[0].longest * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
+        results.append(see(round(size)))
+    by_size = {round(results[0].passes[0].longest * DETECTION.size_step**n): each for n, each in enumerate(results)}
+    best = results[order_ratings([each.rating for each in results])[0]]
+    searched = choose_size(by_size.__getitem__, results[0])[0]
+    most = max(scores.values())
+    losses = [most - scores[each.passes[0].longest] for each in (best, searched)]
+    print(f"\nlost over the whole range {losses[0]:.3f}, by the search {losses[1]:.3f}", flush=True)
+    return losses[0], losses[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--cut", action="store_true")
+    parser.add_argument("--cache", type=Path, default=Path("results/sizes"))
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", InputWarning)
+    losses = []
+    for folder in args.scenes:
+        name = folder.resolve().name
+        losses.append(sweep(folder, args.cache / name))
+        if args.cut:
+            losses.append(sweep(cut_photos(folder, args.cache / "cut" / name), args.cache / f"{name}-cut"))
+    known = np.array([each for each in losses if not np.isnan(each[0])])
+    print(f"\n{len(known)} with a truth: lost {known.mean(0).round(3)} on average, {known.max(0).round(3)} at most")
+
+
+if __name__ == "__main__":
+    main()
