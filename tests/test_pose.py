@@ -161,7 +161,7 @@ def test_a_video_gives_photos(tmp_path: Path, quick: list, capsys: pytest.Captur
     ):
         assert main(["pose", str(tmp_path / name), "--out", str(tmp_path / "out"), "--quiet"]) == 2
         assert message in capsys.readouterr().err
-    assert len(quick) == 1
+    assert len(quick) > 1  # frames between those that do not register are tried, too
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "still.mp4", "walk.mp4"]
 
 

@@ -1,6 +1,4 @@
-"""How sure a focal length is: it scales all depths and heights, and residuals do not show that it is wrong; and whether
-one lens took all photos that are to share one.
-"""
+"""How sure a focal length is: it scales all depths and heights, and residuals do not show that it is wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +10,6 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mvseg.findings.finding import Finding
-from mvseg.poses.cancellable import quiet_colmap
 from mvseg.poses.numbers import TABLE
 
 
@@ -49,7 +46,7 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
     determined.
     """
     covariance = None if is_given else _covariance(model)
-    noise_px, lengths = _noise_px(model), []
+    noise, lengths = noise_px(model), []
     for _, camera in sorted(model.cameras.items()):
         focal, *_ = camera.focal_length_idxs()
         px, deviation = float(camera.params[focal]), None
@@ -57,57 +54,9 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
             deviation = px
         if covariance is not None:
             of_lens = covariance.get_other_params_cov(camera.params)
-            deviation = px if of_lens is None else _deviation(camera, noise_px**2 * of_lens, focal)
+            deviation = px if of_lens is None else _deviation(camera, noise**2 * of_lens, focal)
         lengths.append(FocalLength(px, deviation))
     return lengths
-
-
-def find_zooms(model: pycolmap.Reconstruction) -> NDArray[np.float64] | None:
-    """The focal length of each photo of a model in which several share a lens, if they do not: pixels, in the order of
-    the photos' numbers. None if one lens explains them, or nothing can be told.
-
-    One bundle adjustment with a lens for each photo, from where that of the shared lens ended.
-    """
-    if len(model.cameras) == model.num_reg_images():
-        return None
-    own = _with_own_lenses(model)
-    with quiet_colmap():
-        adjuster = _adjuster(own, pycolmap.BundleAdjustmentOptions(print_summary=False))
-        adjuster.solve()
-        own.update_point_3d_errors()
-        covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), own, adjuster)
-    cameras = [own.cameras[number] for number in sorted(own.cameras)]
-    covariances = [None if covariance is None else covariance.get_other_params_cov(each.params) for each in cameras]
-    if any(each is None for each in covariances):
-        return None
-    lengths = np.array([each.params[0] for each in cameras])
-    deviations = _noise_px(own) * np.sqrt([each[0, 0] for each in covariances if each is not None])
-    groups: dict[int, list[int]] = {}
-    for place, number in enumerate(sorted(own.cameras)):
-        groups.setdefault(model.images[number].camera_id, []).append(place)
-    spread = max(float(lengths[group].std() / lengths[group].mean()) for group in groups.values())
-    doubt = float(np.median(deviations / lengths))
-    return lengths if spread > max(TABLE.most_sd, TABLE.apart * doubt) else None
-
-
-def zoom_finding(lengths: NDArray[np.float64], shared: float) -> Finding:
-    """The finding about focal lengths (V,) of photos that one lens of the focal length `shared` was to explain."""
-    return Finding("zooms", values={"low": float(lengths.min()), "high": float(lengths.max()), "shared": shared})
-
-
-def _with_own_lenses(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The same photos and points, where each photo has a camera of its own with the number of the photo."""
-    own = pycolmap.Reconstruction()
-    for number in model.reg_image_ids():
-        image, camera = model.images[number], model.cameras[model.images[number].camera_id]
-        lens = {"model": camera.model_name, "width": camera.width, "height": camera.height}
-        own.add_camera_with_trivial_rig(pycolmap.Camera(**lens, params=camera.params.copy(), camera_id=number))
-        pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        alone = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=number, image_id=number)
-        own.add_image_with_trivial_frame(alone, image.cam_from_world())
-    for point in model.points3D.values():
-        own.add_point3D(point.xyz, point.track, point.color)
-    return own
 
 
 def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: int) -> float:
@@ -122,11 +71,11 @@ def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: 
 
 def _covariance(model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
     """The covariance of all parameters, for residuals of 1 pixel; None where they are not determined."""
-    adjuster = _adjuster(model, pycolmap.BundleAdjustmentOptions(refine_principal_point=True))
-    return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+    adjusting = adjuster(model, pycolmap.BundleAdjustmentOptions(refine_principal_point=True))
+    return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjusting)
 
 
-def _adjuster(
+def adjuster(
     model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
 ) -> pycolmap.CeresBundleAdjuster:
     """A bundle adjustment of all photos of a model."""
@@ -137,7 +86,7 @@ def _adjuster(
     return pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
 
 
-def _noise_px(model: pycolmap.Reconstruction) -> float:
+def noise_px(model: pycolmap.Reconstruction) -> float:
     """Standard deviation of each coordinate of a feature: more than residuals, which points and poses make small."""
     points = model.points3D.values()
     lengths = np.array([point.track.length() for point in points])

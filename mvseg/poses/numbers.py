@@ -31,6 +31,7 @@ class StructureNumbers:
     # quarters, but a few good pairs more are missed.
     least_alike: int = 8  # chosen: coarse features that two photos must share to be alike
     pairs_at_once: int = 100  # limit: pairs of a call, which indexes each photo: at 10 it takes several times as long
+    zoom_step: float = 1.02  # chosen: ratio of digital zooms from which they are two; they jitter by 0.001
     seed: int = 0  # definition: seed of all random draws
     quality: int = 95  # definition: JPEG quality of photos that are written anew
 
@@ -47,6 +48,8 @@ class VideoNumbers:
     corners: int = 200  # limit: corners that are followed; a third fewer or more measure a tenth less or more motion
     least_corners: int = 3  # limit: min. corners that are found again, to measure a motion
     least_followed: float = 0.5  # chosen: share of the corners that are still followed, below which new ones are found
+    whole: float = 0.95  # chosen: share of the frames that a file states, below which it ended early
+    damaged: int = 64  # limit: places in a row without a frame, after which the film is at its end
     window: int = 21  # definition: pixels of OpenCV's window around a corner
     levels: int = 4  # limit: halvings of the picture: motion of up to 160 pixels of `small`
 
@@ -78,12 +81,28 @@ class TableNumbers:
     starts: tuple[float, ...] = (0.7, 1.4, 2.8)  # definition: focal lengths in longer sides: from phones to telephoto
     noise_px: float = 0.1  # chosen: standard deviation of the corners, until it is measured
     least_noise_px: float = 0.02  # chosen: the same that is believed, at least
-    apart: float = 3.0  # chosen: spread of focal lengths of single photos, in their deviation, above which they differ
     most_sd: float = 0.01  # chosen: standard deviation of a focal length, as a share of it; more shows in heights
     off_middle: float = 0.01  # chosen: sd of principal points of phones, cameras and webcams, in longer sides
 
 
+@dataclass(frozen=True)
+class LensNumbers:
+    """Faults of a shared lens, as simulated walks and a real fern show them; noises are shares of that of the shared
+    lens. Right photos: spread 0.006 at most, two focal lengths 0.998, own principal points 0.949 (docs/pose.md)."""
+
+    zoomed: float = 0.03  # chosen: spread of focal lengths of single photos; zooms of 1.3 have 0.125, cut photos 0.017
+    noise_of_zooms: float = 0.8  # chosen: with lenses of their own; zooms have 0.53, other faults 0.93
+    squashed: float = 0.05  # chosen: |log| of a pixel's width over its height
+    most_aspect_sd: float = 0.02  # chosen: from which that is not known; level walks have 0.12, others 0.016
+    noise_of_squashed: float = 0.98  # chosen: with two focal lengths; squashed photos have 0.80 to 0.94
+    noise_of_cut: float = 0.9  # chosen: with a free principal point; cut photos have 0.68
+    noise_of_cut_each: float = 0.85  # chosen: with principal points of their own; photos that are cut anew have 0.74
+    gain_of_own: float = 0.95  # chosen: the same, in the noise of the best of the others
+    noise_of_fisheye: float = 0.8  # chosen: with a fisheye; an action camera has 0.47
+
+
 STRUCTURE = StructureNumbers()
+LENS = LensNumbers()
 VIDEO = VideoNumbers()
 WORLD = WorldNumbers()
 TABLE = TableNumbers()

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 from PIL import Image, ImageOps
@@ -39,8 +41,9 @@ class PhotoFile:
         name: path below `images/`, "/" between folders.
         width: pixels.
         height: pixels.
-        optics: what EXIF says of camera model, focal length and digital zoom; "" where it says nothing.
+        optics: what EXIF says of camera model and focal length; "" where it says nothing.
         is_turned: it was turned upright, as EXIF asks.
+        zoom: digital zoom; 1 where EXIF says nothing.
     """
 
     name: str
@@ -48,6 +51,7 @@ class PhotoFile:
     height: int
     optics: str = ""
     is_turned: bool = False
+    zoom: float = 1.0
 
     @property
     def folder(self) -> str:
@@ -85,7 +89,7 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     """
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: {problem}, expected a folder of photos or a video (MP4, MOV, AVI, MKV, WebM)")
+        raise InputError(f"{folder}: {problem}, expected a folder of photos or a video (MP4, MOV, 3GP, AVI, MKV, WebM)")
     files = _files_in(folder)
     if not _are_photos(files) and _are_photos(_files_in(folder / "images")):
         folder, files = folder / "images", _files_in(folder / "images")
@@ -138,7 +142,7 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     orientation = read_orientation(source)
     turned = orientation != 1
     image = read_image(source)  # decoded, so that a truncated file is found now
-    optics = _describe_optics(image)
+    optics, zoom = _describe_optics(image)
     is_heic = source.suffix.lower() in HEIC_SUFFIXES
     if is_heic or (turned and image.format == "JPEG"):
         path = path.with_suffix(".jpg") if is_heic else path
@@ -155,17 +159,21 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     else:
         shutil.copyfile(source, path)
     name = path.relative_to(images).as_posix()
-    return PhotoFile(name=name, width=image.width, height=image.height, optics=optics, is_turned=turned)
+    return PhotoFile(
+        name=name, width=image.width, height=image.height, optics=optics, is_turned=turned, zoom=zoom
+    )
 
 
-def _describe_optics(image: Image.Image) -> str:
+def _describe_optics(image: Image.Image) -> tuple[str, float]:
+    """`PhotoFile.optics` and `PhotoFile.zoom`."""
     try:
         exif = image.getexif()
         block = exif.get_ifd(EXIF_BLOCK)
-        known = [exif.get(CAMERA_MODEL), block.get(FOCAL_LENGTH), block.get(FOCAL_LENGTH_35MM), block.get(DIGITAL_ZOOM)]
+        told = [exif.get(CAMERA_MODEL), block.get(FOCAL_LENGTH), block.get(FOCAL_LENGTH_35MM)]
+        zoom = float(block.get(DIGITAL_ZOOM) or 1)
     except Exception:  # a damaged EXIF block says nothing
-        return ""
-    return " ".join(str(each).strip("\0 ") for each in known if each)
+        return "", 1.0
+    return " ".join(str(each).strip("\0 ") for each in told if each), zoom if zoom > 0 and zoom < math.inf else 1.0
 
 
 def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) -> list[list[PhotoFile]]:
@@ -174,14 +182,17 @@ def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) 
     Args:
         photos: in any order, which stays within a group.
         shared: True: one camera took all; False: each photo has its own; None: photos of one folder, size and (EXIF)
-            focal length share one.
+            focal length share one, and nearly one digital zoom, which jitters.
 
     Raises:
         InputError: photos of different sizes are to share one camera.
     """
     groups: dict[object, list[PhotoFile]] = defaultdict(list)
+    zooms = sorted({photo.zoom for photo in photos})
+    is_new = [after > STRUCTURE.zoom_step * before for before, after in pairwise(zooms)]
+    level = dict(zip(zooms, accumulate([0, *is_new]), strict=True))
     for photo in photos:
-        key = (photo.folder, photo.width, photo.height, photo.optics)
+        key = (photo.folder, photo.width, photo.height, photo.optics, level[photo.zoom])
         groups["all" if shared else photo.name if shared is False else key].append(photo)
     for first, *others in groups.values():
         for other in others:

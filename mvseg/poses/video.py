@@ -7,23 +7,25 @@ the picture says how far the camera has come. Where it stands still, frames woul
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, warn
+from mvseg.findings.finding import Finding
 from mvseg.poses.numbers import STRUCTURE, VIDEO
 from mvseg.system.running import progress_bar
 
 Grey = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".avi", ".mkv", ".webm")
 SILENT = "-8"  # of FFmpeg's log, which is for its developers
 
 
@@ -35,11 +37,18 @@ class Footage:
         frames: (F,) int64, numbers of the frames in the video, from 0.
         motion: (F,) how far the picture has moved since the first frame, in longer sides of it; it never falls.
         sharpness: (F,) variance of the Laplacian.
+        stated: number of frames that the file states; 0 where it states none.
     """
 
     frames: NDArray[np.int64]
     motion: Floats
     sharpness: Floats
+    stated: int = 0
+
+    @property
+    def ends_early(self) -> bool:
+        """Whether far fewer frames can be read than the file states."""
+        return int(self.frames[-1]) + int(np.diff(self.frames).max(initial=1)) < VIDEO.whole * self.stated
 
 
 def is_video(path: Path) -> bool:
@@ -47,34 +56,34 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def write_frames(clip: Path, folder: Path, *, most: int) -> list[str]:
-    """Write the sharp frames of a video into a new folder as JPEG, upright; returns their names, in order of time.
+def write_frames(clip: Path, folder: Path, numbers: Sequence[int]) -> list[str]:
+    """Write frames of a video into a new folder as JPEG, upright; returns their names, in order of time.
 
     Args:
         folder: made here.
-        most: number of frames, at most; a video with less motion gives fewer.
+        numbers: of the frames, from 0.
 
     Raises:
-        InputError: the video cannot be opened or read, or shows too little motion.
+        InputError: the video cannot be opened.
     """
-    footage = watch(clip)
-    chosen = set(choose_frames(footage, most=most))
-    if len(chosen) < STRUCTURE.least:
-        moved, wanted = footage.motion[-1], STRUCTURE.least * VIDEO.step
-        message = f"the picture moves by {moved:.0%} of its longer side in {len(footage.frames)} frames"
-        raise InputError(f"{clip}: {message}, expected {wanted:.0%} or more: a walk round the plant")
     folder.mkdir(parents=True)
     names = []
     with _opened(clip) as video:
-        for number, frame in _read(video, sorted(chosen)):
-            names.append(f"frame-{number:06d}.jpg")
+        for number, frame in _read(video, sorted(numbers)):
+            names.append(frame_name(number))
             if not cv2.imwrite(str(folder / names[-1]), frame, [cv2.IMWRITE_JPEG_QUALITY, STRUCTURE.quality]):
                 raise OSError(f"{folder / names[-1]} cannot be written")
     return names
 
 
+def frame_name(number: int) -> str:
+    """Name of the photo that a frame becomes."""
+    return f"frame-{number:06d}.jpg"
+
+
 def watch(clip: Path) -> Footage:
-    """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second.
+    """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second. Warns (InputWarning) of a
+    video that ends early: it is cut short or damaged, or the first of its streams is shorter.
 
     Raises:
         InputError: the video cannot be opened, or has no frames.
@@ -85,6 +94,7 @@ def watch(clip: Path) -> Footage:
     with _opened(clip) as video, progress_bar(name="video", unit="frame") as bar:
         rate = video.get(cv2.CAP_PROP_FPS)
         every = max(1, round(rate / VIDEO.per_second)) if 0 < rate < 1000 else 1
+        total = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
         track, base = None, 0.0
         for number, frame in _read(video, every=every):
             grey = _shrink(frame)
@@ -95,8 +105,23 @@ def watch(clip: Path) -> Footage:
             sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
             bar.update(1)
     if not numbers:
-        raise InputError(f"{clip}: no frame of the video can be read, expected MP4, MOV, AVI, MKV or WebM")
-    return Footage(frames=np.array(numbers), motion=np.array(motion), sharpness=np.array(sharpness))
+        raise InputError(f"{clip}: no frame of the video can be read, expected MP4, MOV, 3GP, AVI, MKV or WebM")
+    footage = Footage(
+        frames=np.array(numbers), motion=np.array(motion), sharpness=np.array(sharpness), stated=max(total, 0)
+    )
+    if footage.ends_early:
+        warn(Finding("film_ends_early", clip.name, {"count": numbers[-1] + 1, "total": total}))
+    return footage
+
+
+def check_motion(clip: Path, footage: Footage, chosen: Sequence[int]) -> None:
+    """Raises InputError: the frames that were chosen are too few, as the picture moves too little."""
+    if len(chosen) < STRUCTURE.least:
+        moved, wanted = footage.motion[-1], STRUCTURE.least * VIDEO.step
+        message = f"the picture moves by {moved:.0%} of its longer side in {len(footage.frames)} frames"
+        if footage.ends_early:
+            message += f", all that can be read of the {footage.stated} that the file states: copy or convert it again"
+        raise InputError(f"{clip}: {message}, expected {wanted:.0%} or more: a walk round the plant")
 
 
 def choose_frames(footage: Footage, *, most: int) -> list[int]:
@@ -115,6 +140,24 @@ def choose_frames(footage: Footage, *, most: int) -> list[int]:
         if len(inside):
             chosen.append(int(footage.frames[inside[np.argmax(footage.sharpness[inside])]]))
     return sorted(set(chosen))
+
+
+def fill_gaps(footage: Footage, chosen: Sequence[int], registered: Collection[int], *, most: int) -> list[int]:
+    """The chosen frames, and one in the middle of each gap of which an end did not register: photos there join the
+    others. At most `most` in all; the widest gaps first, by motion.
+
+    Args:
+        chosen: numbers of frames, ascending.
+        registered: those of them that have a pose.
+    """
+    middles = []
+    for before, after in pairwise(chosen):
+        inside = np.flatnonzero((footage.frames > before) & (footage.frames < after))
+        if len(inside) and not (before in registered and after in registered):
+            ends = np.interp((before, after), footage.frames, footage.motion)
+            middle = inside[np.abs(footage.motion[inside] - ends.mean()).argmin()]
+            middles.append((float(ends[0] - ends[1]), int(footage.frames[middle])))
+    return sorted({*chosen, *(number for _, number in sorted(middles)[: max(most - len(chosen), 0)])})
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,21 +217,46 @@ def _opened(clip: Path) -> Iterator[cv2.VideoCapture]:
     video = cv2.VideoCapture(str(clip.resolve()))  # a relative path may begin as a protocol does
     try:
         if not video.isOpened():
-            raise InputError(f"{clip}: the video cannot be opened, expected MP4, MOV, AVI, MKV or WebM")
+            raise InputError(f"{clip}: the video cannot be opened, expected MP4, MOV, 3GP, AVI, MKV or WebM")
         yield video
     finally:
         video.release()
 
 
 def _read(
-    video: cv2.VideoCapture, numbers: list[int] | None = None, *, every: int = 1
+    video: cv2.VideoCapture, numbers: Sequence[int] | None = None, *, every: int = 1
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Read numbers and frames (H, W, 3) BGR: the frames of given numbers, or one of every so many."""
+    """Read numbers and frames (H, W, 3) BGR, with square pixels: the frames of given numbers, or one of every so many.
+
+    Behind a damaged place frames are smeared; they count, and are left out up to the next frame that stands alone.
+    """
     wanted = None if numbers is None else set(numbers)
-    number = 0
-    while video.grab():  # seeking would be quicker, and lands elsewhere in many files
-        if number % every == 0 if wanted is None else number in wanted:
+    number = num_failed = 0
+    is_smeared = False
+    while num_failed < VIDEO.damaged:
+        if not video.grab():  # seeking would be quicker, and lands elsewhere in many files
+            num_failed, is_smeared = num_failed + 1, True
+            continue
+        num_failed = 0
+        is_smeared = is_smeared and int(video.get(cv2.CAP_PROP_FRAME_TYPE)) != ord("I")
+        if not is_smeared and (number % every == 0 if wanted is None else number in wanted):
             is_read, frame = video.retrieve()
             if is_read:
-                yield number, np.asarray(frame, np.uint8)
+                yield number, square_pixels(np.asarray(frame, np.uint8), *_aspect(video))
         number += 1
+
+
+def _aspect(video: cv2.VideoCapture) -> tuple[float, float]:
+    """Width and height of a pixel, as frames are turned; (1, 1) where the file does not say."""
+    width, height = video.get(cv2.CAP_PROP_SAR_NUM), video.get(cv2.CAP_PROP_SAR_DEN)
+    if width <= 0 or height <= 0:
+        return 1.0, 1.0
+    is_turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META)) % 180 == 90 and video.get(cv2.CAP_PROP_ORIENTATION_AUTO)
+    return (height, width) if is_turned else (width, height)
+
+
+def square_pixels(frame: NDArray[np.uint8], width: float, height: float) -> NDArray[np.uint8]:
+    """A frame (H, W, 3) whose pixels are `width` x `height`, in square ones; the shorter side of a pixel stays."""
+    least = min(width, height)
+    size = round(frame.shape[1] * width / least), round(frame.shape[0] * height / least)
+    return frame if size == frame.shape[1::-1] else np.asarray(cv2.resize(frame, size), np.uint8)

@@ -13,20 +13,22 @@ import pycolmap
 
 from mvseg._version import made_by
 from mvseg.errors import InputError, collect_warnings, warn
-from mvseg.findings.finding import list_some
-from mvseg.formats.opencv_yaml import read_calibration
+from mvseg.findings.finding import Finding, list_some
+from mvseg.formats.opencv_yaml import Calibration, read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import PoseConfig, WorldFacts
-from mvseg.poses.focal_length import FocalLength, find_zooms, focal_lengths, least_sure, zoom_finding
+from mvseg.poses.focal_length import FocalLength, focal_lengths, least_sure
 from mvseg.poses.known_world import Placement, place
+from mvseg.poses.lens_faults import LensReport, find_lens_fault
 from mvseg.poses.mapping import Structure, find_structure
+from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
-from mvseg.poses.video import is_video, write_frames
+from mvseg.poses.video import check_motion, choose_frames, fill_gaps, frame_name, is_video, watch, write_frames
 from mvseg.results.earlier import Output, check_out, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
-from mvseg.system.running import now_running
+from mvseg.system.running import now_running, report_step
 from mvseg.system.say import say
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
@@ -69,12 +71,16 @@ def pose_photos(
     with replace_result(out, run, output) as folder:
         with collect_warnings() as findings:
             images = folder / IMAGES
-            files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, images)
-            structure = find_structure(images, files, config=config, calibration=calibration, work=folder)
+            if is_clip:
+                files, structure = _find_structure_of_clip(photos, folder, config=config, calibration=calibration)
+            else:
+                files = copy_photos(source, names, images)
+                structure = find_structure(images, files, config=config, calibration=calibration, work=folder)
+            report = find_lens_fault(structure.model) if calibration is None else LensReport(None, structure.model)
+            structure = replace(structure, model=report.model)
             lengths = focal_lengths(structure.model, is_given=calibration is not None)
-            zooms = None if calibration is not None else find_zooms(structure.model)
-            if zooms is not None:
-                warn(zoom_finding(zooms, lengths[0].px))
+            for finding in _lens_findings(report, files):
+                warn(finding)
             for finding in least_sure(lengths).doubts("focal_length_unsure"):
                 warn(finding)
             placement = place(write_structure(structure, folder), world)
@@ -84,6 +90,7 @@ def pose_photos(
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(world), "up": up}}
         run |= {
+            "square_pixels": "measured" if report.is_square_known else "assumed",
             "up": scene.up,
             "findings": [each.as_json() for each in findings],
             "seconds": round(time.perf_counter() - start, 1),
@@ -93,8 +100,18 @@ def pose_photos(
     if now_running().progress:
         say(summarize_poses(out, structure, placement=placement, scene=scene))
         say(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
+        if not report.is_square_known:
+            say("  pixels are taken as square: photos from one height do not show it")
         say(f"next: mvseg infer {out}")
     return scene
+
+
+def _lens_findings(report: LensReport, photos: Sequence[PhotoFile]) -> list[Finding]:
+    """The fault of the lens; and where squashed photos would not show it, photos of a size that no camera has."""
+    findings = [] if report.finding is None else [report.finding]
+    if not report.is_square_known and any(each.width == each.height for each in photos):
+        findings.append(Finding("square_pixels", values={"width": photos[0].width, "height": photos[0].height}))
+    return findings
 
 
 def check_folders(photos: Path, out: Path, output: Output) -> tuple[Path, list[str]]:
@@ -120,11 +137,35 @@ def check_place(out: Path, output: Output) -> None:
     check_out(out, output)
 
 
-def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig) -> list[PhotoFile]:
-    """The frames of a video as photos of a scene folder."""
-    with tempfile.TemporaryDirectory(dir=folder, prefix="frames-") as work:
-        names = write_frames(clip, Path(work) / "frames", most=config.frames)
-        return copy_photos(Path(work) / "frames", names, folder / IMAGES)
+def _find_structure_of_clip(
+    clip: Path, folder: Path, *, config: PoseConfig, calibration: Calibration | None
+) -> tuple[list[PhotoFile], Structure]:
+    """Choose frames of a video as photos of a scene folder, and estimate their cameras. Where too few register
+    (`STRUCTURE.enough`), frames from the gaps beside the others join the photos, until there are no more."""
+    footage = watch(clip)
+    chosen = choose_frames(footage, most=config.frames)
+    check_motion(clip, footage, chosen)
+    files: dict[int, PhotoFile] = {}
+    while True:
+        new = [number for number in chosen if number not in files]
+        with tempfile.TemporaryDirectory(dir=folder, prefix="frames-") as work:
+            names = write_frames(clip, Path(work) / "frames", new)
+            copied = copy_photos(Path(work) / "frames", names, folder / IMAGES)
+        files |= {number: file for number in new for file in copied if file.name == frame_name(number)}
+        photos = [files[number] for number in sorted(files)]
+        failure: InputError | None = None
+        try:
+            structure = find_structure(folder / IMAGES, photos, config=config, calibration=calibration, work=folder)
+            registered = {number for number, file in files.items() if file.name in structure.registered}
+        except InputError as error:
+            failure, registered = error, set()
+        filled = fill_gaps(footage, sorted(files), registered, most=config.frames)
+        if len(registered) >= STRUCTURE.enough * len(files) or len(filled) == len(files):
+            if failure is not None:
+                raise failure
+            return photos, structure
+        report_step(f"{len(registered)} of {len(files)} frames register; {len(filled) - len(files)} between join them")
+        chosen = filled
 
 
 def describe_poses(

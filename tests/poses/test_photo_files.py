@@ -27,6 +27,8 @@ def save_jpeg(path: Path, orientation: int = 1, **tags: float) -> Path:
     exif[0x0112] = orientation
     exif[0x0110] = "Phone 7"
     exif.get_ifd(0x8769)[0x920A] = tags.get("focal", 4.0)
+    if "zoom" in tags:
+        exif.get_ifd(0x8769)[0xA404] = tags["zoom"]
     Image.fromarray(RAMP).convert("RGB").save(path, format="JPEG", exif=exif, quality=95)
     return path
 
@@ -115,6 +117,14 @@ def test_a_broken_photo_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])
     with pytest.raises(InputError, match=r"a.png: the photo cannot be read.*cut short"):
         copy_photos(tmp_path, ["a.png"], tmp_path / "images")
+
+
+def test_a_digital_zoom_that_jitters_is_one(tmp_path: Path) -> None:
+    zooms = {"a.jpg": 1.0, "b.jpg": 1.001, "c.jpg": 0.9995, "d.jpg": 1.3, "e.jpg": 0.0, "f.jpg": 1.301}
+    for name, zoom in zooms.items():
+        save_jpeg(tmp_path / name, zoom=zoom)
+    groups = group_by_camera(copy_photos(tmp_path, [*zooms], tmp_path / "images"))
+    assert [[photo.name[0] for photo in group] for group in groups] == [["a", "b", "c", "e"], ["d", "f"]]
 
 
 def test_photos_of_one_folder_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:

@@ -12,11 +12,22 @@ import pytest
 from mvseg.errors import InputError
 from mvseg.formats.image_file import read_rgb
 from mvseg.poses.numbers import VIDEO
-from mvseg.poses.video import Footage, choose_frames, is_video, watch, write_frames
+from mvseg.poses.video import (
+    Footage,
+    check_motion,
+    choose_frames,
+    fill_gaps,
+    is_video,
+    square_pixels,
+    watch,
+    write_frames,
+)
 from room_scene import texture
+from warned import warns_of
 
 WIDTH, HEIGHT = 320, 240
-# It stands still, walks, runs and comes to rest: pixels of the picture at each frame.
+# It stands still, walks, runs and comes to rest: pixels of the picture at each frame.from warned import warns_of
+
 PLACES = np.concatenate([np.zeros(12), np.arange(1, 121), 120 + np.arange(1, 21) * 4, np.full(12, 200)]).astype(int)
 
 
@@ -52,7 +63,7 @@ def test_motion_and_sharpness_are_measured(walk: Path) -> None:
 
 
 def test_frames_are_sharp_and_spread_by_motion(walk: Path, tmp_path: Path) -> None:
-    names = write_frames(walk, tmp_path / "frames", most=60)
+    names = write_frames(walk, tmp_path / "frames", choose_frames(watch(walk), most=60))
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == names
     numbers = np.array([int(name[len("frame-") : -len(".jpg")]) for name in names])
     assert (np.diff(numbers) > 0).all()
@@ -68,7 +79,7 @@ def test_frames_are_sharp_and_spread_by_motion(walk: Path, tmp_path: Path) -> No
 
 
 def test_a_long_walk_gives_as_many_frames_as_asked_for(walk: Path, tmp_path: Path) -> None:
-    names = write_frames(walk, tmp_path / "frames", most=6)
+    names = write_frames(walk, tmp_path / "frames", choose_frames(watch(walk), most=6))
     numbers = np.array([int(name[len("frame-") : -len(".jpg")]) for name in names])
     assert len(names) == 6
     np.testing.assert_allclose(np.diff(PLACES[numbers]), 200 / 6, atol=20)
@@ -99,12 +110,53 @@ def test_laws_of_the_choice(most: int, seed: int) -> None:
         assert footage.sharpness[number // 2] >= footage.sharpness[same].max(initial=0)
 
 
+def test_gaps_are_filled_where_frames_did_not_register() -> None:
+    footage = Footage(frames=np.arange(101), motion=np.linspace(0, 1, 101), sharpness=np.ones(101))
+    chosen = [0, 20, 40, 60, 100]
+    assert fill_gaps(footage, chosen, {*chosen}, most=60) == chosen
+    assert fill_gaps(footage, chosen, {0, 20, 40}, most=60) == [0, 20, 40, 50, 60, 80, 100]
+    assert fill_gaps(footage, chosen, {0, 20, 40}, most=6) == [0, 20, 40, 60, 80, 100]  # the widest first
+    assert fill_gaps(footage, chosen, set(), most=60) == [0, 10, 20, 30, 40, 50, 60, 80, 100]
+    assert fill_gaps(footage, [0, 1, 2], set(), most=60) == [0, 1, 2]  # no frames are between
+
+
+def test_frames_of_a_video_whose_pixels_are_not_square() -> None:
+    frame = np.arange(6 * 9 * 3, dtype=np.uint8).reshape(6, 9, 3)
+    assert square_pixels(frame, 1, 1) is frame
+    assert square_pixels(frame, 4, 3).shape == (6, 12, 3)
+    assert square_pixels(frame, 2, 3).shape == (9, 9, 3)  # no pixel is lost
+    np.testing.assert_array_equal(square_pixels(frame.repeat(4, 1), 8, 8), frame.repeat(4, 1))
+
+
+@pytest.mark.parametrize("damage", ["cut short", "in the middle", "none"])
+def test_a_film_that_ends_early_is_said(tmp_path: Path, damage: str) -> None:
+    """Frames behind a damaged place that stand alone are read."""
+    clip = tmp_path / "walk.avi"
+    frames = pan(np.arange(40) * 3)
+    video = cv2.VideoWriter(str(clip), cv2.VideoWriter.fourcc(*"MJPG"), 15.0, (WIDTH, HEIGHT))
+    for frame in frames:
+        video.write(frame)
+    video.release()
+    data = bytearray(clip.read_bytes())
+    if damage == "cut short":
+        data = data[: len(data) // 3]
+    elif damage == "in the middle":
+        middle = data.index(b"00dc", len(data) // 2)
+        data[middle : middle + 12] = bytes(12)
+    clip.write_bytes(data)
+    if damage == "cut short":
+        with warns_of("film_ends_early"):
+            footage = watch(clip)
+        assert len(footage.frames) < 20
+    else:
+        assert len(watch(clip).frames) >= 37
+
+
 @pytest.mark.parametrize("places", [np.zeros(20, int), np.arange(20) // 2])
 def test_too_little_motion_is_one_sentence(tmp_path: Path, places: np.ndarray) -> None:
     clip = write_clip(tmp_path / "still.mp4", pan(places))
     with pytest.raises(InputError, match=r"still.mp4: the picture moves by [0-3]% of its longer side in 20 f"):
-        write_frames(clip, tmp_path / "frames", most=60)
-    assert not (tmp_path / "frames").exists()
+        check_motion(clip, watch(clip), choose_frames(watch(clip), most=60))
 
 
 def test_a_picture_without_texture_does_not_move(tmp_path: Path) -> None:
