@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mvseg.detection.config import DetectConfig
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_choices
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.traits.config import TraitsConfig, Up
@@ -59,6 +59,7 @@ class RunConfig:
     stem_category: str | None = None
 
     def __post_init__(self) -> None:
+        check_choices(self)
         if isinstance(self.learn, int) and self.learn < 1:
             raise InputError(f"learn is {self.learn}, expected 1 or more rounds, auto or off")
         if isinstance(self.views, int) and self.views < 2:
@@ -67,7 +68,6 @@ class RunConfig:
             raise InputError(f"scale is {self.scale:g}, expected a positive number")
         if self.up is not None and not isinstance(self.up, str) and not 0 < math.hypot(*self.up) < math.inf:
             raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")
-
         if self.stem_category is not None and self.categories is None:
             raise InputError("stem_category is given without categories, expected the names of those of leaves, too")
 

@@ -8,10 +8,12 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
-from typing import Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from mvseg.findings.finding import Finding, keep_causes
 
+UNIONS = (Union, UnionType)
 P = ParamSpec("P")
 T = TypeVar("T")
 # Classes that users mix up, with what makes one.
@@ -118,15 +120,22 @@ def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
     return checked
 
 
-def check_choices(config: object, place: str) -> None:
-    """Refuse a value of a field of a frozen config that is none of its `Literal`; `place` is the name of its group of
-    options.
+def check_choices(config: object, place: str = "") -> None:
+    """Refuse a value of a field of a frozen config that is none of its `Literal`, and none of the other types that the
+    field may have; `place` is the name of its group of options, "" for those that have none.
 
     Raises:
         InputError: names the field, the value, and what there is to choose from.
     """
     for name, hint in get_type_hints(type(config)).items():
-        value = getattr(config, name)
-        if get_origin(hint) is Literal and value not in get_args(hint):
-            choices = ", ".join(map(str, get_args(hint)))
-            raise InputError(f"{place}.{name} is {value!r}, expected one of {choices}")
+        value, members = getattr(config, name), get_args(hint) if get_origin(hint) in UNIONS else (hint,)
+        choices = [each for member in members if get_origin(member) is Literal for each in get_args(member)]
+        if not choices or (isinstance(value, str) and value in choices):
+            continue
+        types = [member for member in members if isinstance(member, type)]
+        is_number = int in types and type(value) is int
+        is_other = any(get_origin(member) is not Literal and member is not int for member in members)
+        if not is_number and (isinstance(value, str) or not is_other or (int in types and value is not None)):
+            expected = ", ".join([*(["a number"] if int in types else []), *map(str, choices)])
+            where = f"{place}.{name}" if place else name
+            raise InputError(f"{where} is {value!r}, expected one of {expected}")

@@ -19,6 +19,7 @@ from mvseg.regions import Regions, stack_regions
 
 T = TypeVar("T")
 
+STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
 SURE = 0.5  # definition: match score, or q, from which a mask likelier shows an instance than not
 COLUMNS = (  # that are tensors
     "instance_ids",

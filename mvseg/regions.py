@@ -286,12 +286,12 @@ def masks_to_boxes(masks: Tensor) -> Tensor:
     return torch.stack((x1, y1, x2, y2), 1)
 
 
-def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
+def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Regions:
     """Regions from one label map per view.
 
     Args:
-        label_maps: V integer arrays (H, W), each of its own size, one at a time in memory; 0 is nothing, 65535 is
-            ignored, every other number is one region of that view.
+        label_maps: V integer arrays or tensors (H, W), each of its own size, one at a time in memory; 0 is nothing,
+            65535 is ignored, every other number is one region of that view.
 
     Returns:
         Regions ordered by view, then by number; `labels` holds the numbers.
@@ -300,7 +300,8 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
         InputError: something else than such an array.
     """
     view_index, boxes, crops, labels, num_views = [], [], [], [], 0
-    for view, label_map in enumerate(label_maps):
+    for view, given in enumerate(label_maps):
+        label_map: object = given.detach().cpu().numpy() if isinstance(given, Tensor) else given
         if not isinstance(label_map, np.ndarray) or label_map.ndim != 2 or label_map.dtype.kind not in "uib":
             kind = f"{type(label_map).__name__} {getattr(label_map, 'shape', '')} {getattr(label_map, 'dtype', '')}"
             raise InputError(f"view {view}: the label map is a {kind.strip()}, expected an integer array (H, W)")

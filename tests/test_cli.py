@@ -146,7 +146,9 @@ def test_demo_has_its_traits(demo: Path) -> None:
     whole = {row["trait"]: float(row["value"]) for row in long if not row["leaf"]}
     assert whole["number_of_leaves"] == 12
     assert whole["total_leaf_area"] == pytest.approx(sum(float(row["area"]) for row in truth.values()), rel=0.02)
-    assert json.loads((demo / "run.json").read_text())["traits"] == {"unit": "mm", "up": [0, 0, 1], "rejected": {}}
+    assert json.loads((demo / "run.json").read_text())["traits"] == {
+        "unit": "mm", "up": [0, 0, 1], "up_from": "scene", "rejected": {}
+    }  # fmt: skip
 
 
 def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -406,6 +406,9 @@ def test_shapes_are_doubtful_unless_areas_are_as_good_as_without_the_reason() ->
     surfaces = {
         leaf: replace(bent_blade(), quality=Quality(dict.fromkeys(each, "why"))) for leaf, each in enumerate(codes, 1)
     }
-    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces))  # type: ignore[arg-type]
+    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces), has_stems=False)  # type: ignore[arg-type]
     assert finding.values == {"count": 2, "total": 4, "leaves": ("3", "4")}
-    assert _find_doubtful(SimpleNamespace(surfaces={1: surfaces[2]})) is None  # type: ignore[arg-type]
+    masks = SimpleNamespace(instance_ids=torch.tensor([1, 4]), classes=torch.tensor([1, 2]))  # 4 is a stem
+    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces, masks=masks), has_stems=True)  # type: ignore[arg-type]
+    assert finding.values == {"count": 1, "total": 3, "leaves": ("3",)}
+    assert _find_doubtful(SimpleNamespace(surfaces={1: surfaces[2]}), has_stems=False) is None  # type: ignore[arg-type]

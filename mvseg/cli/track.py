@@ -1,4 +1,4 @@
-"""The same leaf over days: tracks, growth curves, births and deaths; see docs/tracking.md."""
+"""The same leaf over days: tracks, growth, births and deaths; see docs/tracking.md."""
 
 from __future__ import annotations
 

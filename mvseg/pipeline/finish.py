@@ -12,7 +12,7 @@ from mvseg.corrections.settle import settle_edits
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding, Values, keep_causes
-from mvseg.pipeline.open_scene import STEM_CLASS
+from mvseg.masks import STEM_CLASS
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Result
 from mvseg.system.running import timed
@@ -38,7 +38,8 @@ def check_result(result: Result, plant: Plant) -> Result:
             features=shapes is not None and opened.photos.exist,
             is_detected=opened.given is None,
         )
-    noticed = *check.findings, plant.disagreement, _find_missing(plant, result), _find_doubtful(result)
+    doubtful = _find_doubtful(result, has_stems=plant.opened.config.stem_category is not None)
+    noticed = *check.findings, plant.disagreement, _find_missing(plant, result), doubtful
     findings = keep_causes(each for each in noticed if each is not None and each.code not in REFUSED)
     for finding in findings:
         if finding.level != "note":
@@ -128,8 +129,9 @@ def _find_missing(plant: Plant, result: Result) -> Finding | None:
     return find_missing(result.masks, plant.opened.photos, sure_score=DETECTION.sure_score)
 
 
-def _find_doubtful(result: Result) -> Finding | None:
-    surfaces = result.surfaces or {}
+def _find_doubtful(result: Result, *, has_stems: bool) -> Finding | None:
+    of_stems = result.masks.instance_ids[result.masks.classes == STEM_CLASS].tolist() if has_stems else ()
+    surfaces = {leaf: each for leaf, each in (result.surfaces or {}).items() if leaf not in of_stems}
     leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_harmless)
     if not leaves:
         return None
@@ -158,5 +160,6 @@ def measure(result: Result, config: RunConfig) -> Result:
             photos=result.photos,
             config=config.traits,
             stems=[instance for instance in stems if instance > 0],
+            probabilities=result.instances.probabilities,
         )
     return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits))

@@ -21,7 +21,7 @@ from mvseg.formats.find_views import natural_order
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
-from mvseg.masks import Masks
+from mvseg.masks import STEM_CLASS, Masks
 from mvseg.matching.match import check_baselines, find_disagreement
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.spread_views import find_repeated, spread_views
@@ -30,8 +30,6 @@ from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
 from mvseg.traits.up import place_scene
-
-STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy as np
 from mvseg.findings.finding import Finding
 from mvseg.findings.sentences import UNSURE_IDS
 from mvseg.results.result import Result
+from mvseg.traits.leaf import say_number
 
 # Findings that a card may name, the gravest first; errors stand after the first two. Views from one side explain more
 # than anything else.
@@ -47,15 +48,23 @@ def make_card(result: Result, out: Path) -> Card:
 
 
 def _summarize(result: Result) -> str:
-    num_photos, num_leaves = len(result.scene.views), result.matching.num_instances
-    sentence = f"{_count(num_leaves, 'leaf', 'leaves')} in {_count(num_photos, 'photo', 'photos')}"
+    kinds = {} if result.traits is None else result.traits.rejected
+    stems = [leaf for leaf, kind in kinds.items() if kind == "stem"]
+    num_photos, num_leaves = len(result.scene.views), result.matching.num_instances - len(stems)
+    sentence = _count(num_leaves, "leaf", "leaves") + (f" and {_count(len(stems), 'stem', 'stems')}" if stems else "")
+    sentence += f" in {_count(num_photos, 'photo', 'photos')}"
     if result.traits is not None and (counted := int(result.traits.whole["number_of_leaves"].value)) != num_leaves:
         sentence += f", {counted} of which count in the plant's traits"
     if result.learned.rounds:
         rounds = _count(result.learned.rounds, "round", "rounds")
         sentence += f", seen by a detector that learned this plant in {rounds}"
     if result.traits is not None and (area := result.traits.whole["total_leaf_area"]).exists and num_leaves:
-        sentence += f"; total area {_say_number(area.value, area.sd)} {result.traits.unit or 'world unit'}^2"
+        unit = f"{result.traits.unit or 'world unit'}^2"
+        sentence += f"; total area {say_number(area.value, area.sd)} {unit}"
+        useless = [each for each in result.traits.leaves if each.use == "no" and each.rejection is None]
+        out = [each.numbers["area"].value for each in useless]
+        if lost := [value for value in out if np.isfinite(value)]:
+            sentence += f", without {_count(len(lost), 'leaf', 'leaves')} of {sum(lost):,.4g} {unit} that fit badly"
     return sentence
 
 
@@ -84,14 +93,6 @@ def has_tried_to_learn(result: Result) -> bool:
     """Whether the detector has tried to learn the plant in this run, or had too few leaves to learn from."""
     tried = result.learned.rounds > 0 or len(result.learned.agreed_area) > 1
     return tried or any(each.code in ("learned_too_few", "learning_failed") for each in result.findings)
-
-
-def _say_number(value: float, sd: float) -> str:
-    """With two digits of its standard deviation, if that is known; ASCII, since not every terminal knows more."""
-    if not np.isfinite(sd) or sd <= 0:
-        return f"{value:,.4g}"
-    decimals = 1 - int(np.floor(np.log10(sd)))
-    return " +- ".join(f"{round(number, decimals):,.{max(decimals, 0)}f}" for number in (value, sd))
 
 
 def _count(number: int, one: str, many: str) -> str:

@@ -104,6 +104,7 @@ def describe_result(result: Result) -> dict[str, Any]:
     }
     if (traits := result.traits) is not None:
         record["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
+        record["traits"] |= {"up_from": traits.up_from}
     if (learned := result.learned).agreed_area:
         record["learned"] = {"rounds": learned.rounds, "agreed_area": learned.agreed_area}
     if result.corrections is not None and result.corrections.edits:

@@ -64,7 +64,7 @@ def write_plant(result: Result, folder: Path) -> None:
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
     if result.traits is not None:
         write_long(folder / "traits.csv", result.traits)
-        write_wide(folder / "traits_wide.csv", result.traits, result.instances.probabilities)
+        write_wide(folder / "traits_wide.csv", result.traits)
         if result.traits.stems:
             write_nodes(folder / NODES_FILE, result.traits)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -36,6 +36,7 @@ class TraitsRecord(_Part):
 
     unit: str | None = None
     up: Vector3 | None = None
+    up_from: Literal["scene", "stem", ""] | None = None
     rejected: dict[str, Any] = {}
 
     @property

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality
 from mvseg.reconstruction.voxels import VoxelGrid
 
 SURFACES_FILE, VOXELS_FILE = "surfaces.npz", "voxels.npz"
@@ -78,7 +78,7 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         for leaf, each in surfaces.items():
             if not each.exists and (each.coefficients.isfinite().any() or not each.quality.reasons):
                 raise ValueError(f"leaf {leaf} has coefficients that are not finite")
-        return surfaces
+        return ByInstance(surfaces)
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None
 
@@ -110,7 +110,7 @@ def read_voxels(path: Path) -> dict[int, VoxelGrid]:
     try:
         if not (np.isfinite(arrays["origin"]).all() and np.isfinite(arrays["voxel_size"]).all()):
             raise ValueError("a grid lies at no place")
-        return {
+        return ByInstance({
             int(leaf): VoxelGrid(
                 origin=torch.from_numpy(arrays["origin"][row].copy()),
                 voxel_size=float(arrays["voxel_size"][row]),
@@ -119,7 +119,7 @@ def read_voxels(path: Path) -> dict[int, VoxelGrid]:
                 threshold=float(arrays["threshold"][row]),
             )
             for row, leaf in enumerate(arrays["leaf"].tolist())
-        }
+        })
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no voxels that mvseg wrote ({error})") from None
 

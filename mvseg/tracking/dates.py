@@ -85,6 +85,7 @@ class PlantOnDate:
         knows_up: +z of its frame is up.
         leaves: those that count as leaves, or may do so, by id.
         whole: {trait: number} of the plant.
+        up_from: where up comes from, see `Traits.up_from`.
         folder: of the result; None in memory.
         pictures: {leaf: picture} for a page; empty where nobody asked for them.
         photo: JPEG of the plant for a page, or nothing.
@@ -97,6 +98,7 @@ class PlantOnDate:
     knows_up: bool
     leaves: tuple[SeenLeaf, ...]
     whole: Mapping[str, Number]
+    up_from: str = ""
     folder: Path | None = None
     pictures: Mapping[int, LeafPicture] = field(default_factory=dict)
     photo: bytes = b""
@@ -136,7 +138,7 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     traits = result.traits
     if traits is None:
         raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
-    frame, leaves = None if traits.up is None else level_frame(traits.up), []
+    frame, leaves = level_frame(traits.up) if traits.up is not None and traits.up_from == "scene" else None, []
 
     def numbers_of(measured: Mapping[str, Measurement]) -> dict[str, Number]:
         units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in measured}
@@ -156,6 +158,7 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
         knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole),
+        up_from=traits.up_from,
     )  # fmt: skip
 
 

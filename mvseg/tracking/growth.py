@@ -1,4 +1,4 @@
-"""Growth: curves and rates of each leaf, and what the plant as a whole does from date to date.
+"""Growth: rates of each leaf, and what the plant as a whole does from date to date.
 
 Standard deviations are those of the surfaces, carried through; errors of different dates count as independent.
 """
@@ -7,23 +7,19 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.special import expit
 
 from mvseg.tracking.dates import Floats, Number
-from mvseg.tracking.numbers import GROWTH
 from mvseg.tracking.track import Tracks
 
 TRAITS = (
     "area", "length", "width", "inclination", "curvature", "insertion_height", "node_height", "internode",
     "greenness_index",
 )  # fmt: skip
-SIZES = ("area", "length", "width")  # get a curve, too
+HEIGHTS = ("insertion_height", "node_height")  # start somewhere on each date
 NOTHING = Number(math.nan, math.nan, "")
 
 
@@ -38,33 +34,6 @@ class GrowthPoint:
     number: Number
     rate: float
     rate_sd: float
-
-
-@dataclass(frozen=True)
-class GrowthCurve:
-    """A smooth curve through the sizes of one leaf.
-
-    Attributes:
-        track, trait: whose.
-        model: "constant" (full-grown, K), "logistic", K / (1 + exp(-r (t - t0))), or "expolinear",
-            (c / r) ln(1 + exp(r (t - t0))).
-        parameters: K, or the rate c of the linear growth; r, per day; and t0, days. The latter are NaN of a constant.
-        sds: standard deviations of these three; NaN where the dates do not tell them.
-        residual: root mean square of residuals, in standard deviations of the sizes.
-        criterion: Akaike's.
-    """
-
-    track: int
-    trait: str
-    model: str
-    parameters: tuple[float, ...]
-    sds: tuple[float, ...]
-    residual: float
-    criterion: float
-
-    def at(self, times: Floats) -> Floats:
-        """The sizes at times (T,)."""
-        return CURVES[self.model](self.parameters, times)
 
 
 @dataclass(frozen=True)
@@ -95,44 +64,98 @@ class Growth:
 
     Attributes:
         points: all traits of all tracks on the dates on which they were measured, by track, trait and time.
-        curves: of each size with `GROWTH.least_dates` dates or more, by track and trait.
         plant: one row per date.
     """
 
     points: tuple[GrowthPoint, ...]
-    curves: tuple[GrowthCurve, ...]
     plant: tuple[PlantRow, ...]
 
 
 def measure_growth(tracks: Tracks) -> Growth:
-    """The growth of all leaves, and of the plant."""
+    """The growth of all leaves, and of the plant.
+
+    Heights of a pot whose lowest leaf is another one from some date on start from the base of the lowest leaf that all
+    dates have; where there is none, no rate is between dates of different origins. The same holds for heights along
+    different stems, and for internodes above different leaves.
+    """
     numbers = [{leaf.leaf: leaf.numbers for leaf in date.leaves} for date in tracks.dates]
     dates_of: dict[int, list[tuple[int, int]]] = {}
     for row in tracks.rows:
         if row.leaf is not None:
             dates_of.setdefault(row.track, []).append((row.date, row.leaf))
-    numbers_of: dict[str, dict[int, dict[int, Number]]] = {
-        trait: {
+    points: list[GrowthPoint] = []
+    for trait in TRAITS:
+        by_track = {
             track: {date: numbers[date][leaf][trait] for date, leaf in observations if trait in numbers[date][leaf]}
             for track, observations in sorted(dates_of.items())
         }
-        for trait in TRAITS
-    }
-    points: list[GrowthPoint] = []
-    curves = []
-    for track, trait in product(sorted(dates_of), TRAITS):
-        by_date = numbers_of[trait][track]
-        times = np.array([tracks.dates[date].time for date in by_date])
-        values = np.array([number.value for number in by_date.values()])
-        sds = np.array([number.sd for number in by_date.values()])
-        for place, (date, number) in enumerate(by_date.items()):
-            near = slice(max(place - 1, 0), place + 2)
-            is_told = place > 0 or len(by_date) > 2
-            rates = slope(times[near], values[near], sds[near]) if is_told else (math.nan, math.nan)
-            points.append(GrowthPoint(track, trait, date, number, *rates))
-        if trait in SIZES and len(by_date) >= GROWTH.least_dates:
-            curves.append(fit_curve(track, trait, (times, values, sds)))
-    return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
+        origins = find_origins(tracks, trait)
+        if trait in HEIGHTS:
+            by_track, origins = _with_one_origin(tracks, by_track, origins)
+        for track, by_date in by_track.items():
+            points += _points(tracks, track, trait, by_date, origins={date: origins[date, track] for date in by_date})
+    points.sort(key=lambda point: (point.track, TRAITS.index(point.trait)))
+    return Growth(tuple(points), tuple(_plant_rows(tracks, points)))
+
+
+def _points(
+    tracks: Tracks, track: int, trait: str, by_date: Mapping[int, Number], *, origins: Mapping[int, Hashable]
+) -> Iterator[GrowthPoint]:
+    """One trait of one leaf, with its rates; `origins`: of each date."""
+    dates, is_told = list(by_date), len(by_date) > 2
+    times = np.array([tracks.dates[date].time for date in dates])
+    values, sds = (np.array([getattr(number, name) for number in by_date.values()]) for name in ("value", "sd"))
+    for place, (date, number) in enumerate(by_date.items()):
+        around = range(max(place - 1, 0), min(place + 2, len(dates)))
+        near = [each for each in around if origins[dates[each]] == origins[date]]
+        rates = slope(times[near], values[near], sds[near]) if place > 0 or is_told else (math.nan, math.nan)
+        yield GrowthPoint(track, trait, date, number, *rates)
+
+
+def find_origins(tracks: Tracks, trait: str) -> dict[tuple[int, int], Hashable]:
+    """{(date, track): where numbers of a trait start}: those of equal origins may be compared."""
+    track_of = {(row.date, row.leaf): row.track for row in tracks.rows if row.leaf is not None}
+    origins: dict[tuple[int, int], Hashable] = {}
+    for index, date in enumerate(tracks.dates):
+        axis = index if date.up_from == "stem" else -1  # a stem leans otherwise on each date
+        blades = [leaf for leaf in date.leaves if leaf.points is not None and "insertion_height" in leaf.numbers]
+        lowest = min(blades, key=lambda leaf: float(np.asarray(leaf.points)[:, 2].min()), default=None)
+        nodes = {leaf.node: leaf.leaf for leaf in date.leaves if leaf.node is not None}
+        for leaf in date.leaves:
+            key: Hashable = ()
+            if trait == "insertion_height":
+                key = axis, None if lowest is None else track_of[index, lowest.leaf]
+            elif trait == "inclination":
+                key = axis
+            elif leaf.node is not None and trait in ("node_height", "internode"):
+                stem, node = leaf.node
+                below = nodes.get((stem, 1 if trait == "node_height" else node - 1))
+                key = None if below is None else track_of[index, below]
+            origins[index, track_of[index, leaf.leaf]] = key
+    return origins
+
+
+def _with_one_origin(
+    tracks: Tracks, by_track: Mapping[int, Mapping[int, Number]], origins: Mapping[tuple[int, int], Hashable]
+) -> tuple[dict[int, dict[int, Number]], dict[tuple[int, int], Hashable]]:
+    """Heights {track: {date: number}} and their origins; those of a pot with several origins start from the lowest leaf
+    that has a height on all of its dates."""
+    moved, same = {track: dict(numbers) for track, numbers in by_track.items()}, dict(origins)
+    for root in set(tracks.roots):
+        dates = [date for date, each in enumerate(tracks.roots) if each == root]
+        keys = {origins[date, track] for track, numbers in by_track.items() for date in numbers if date in dates}
+        whole = [track for track, numbers in by_track.items() if numbers.keys() >= set(dates)]
+        axes = {date for date in dates if tracks.dates[date].up_from == "stem"}
+        if len(keys) < 2 or not whole or axes:
+            continue
+        reference = min(whole, key=lambda track: np.mean([by_track[track][date].value for date in dates]))
+        for track, numbers in by_track.items():
+            for date in numbers.keys() & set(dates):
+                number, start = numbers[date], by_track[reference][date]
+                sd = 0.0 if track == reference else math.hypot(number.sd, start.sd)
+                moved[track][date] = Number(number.value - start.value, sd, number.unit)
+                same[date, track] = ("one origin", root)
+    return moved, same
 
 
 def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
@@ -143,14 +166,6 @@ def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
     is_known = bool((np.isfinite(sds) & (sds > 0)).all())
     line, covariance = np.polyfit(times - times.mean(), values, 1, w=1 / sds if is_known else None, cov="unscaled")
     return float(line[0]), math.sqrt(covariance[0, 0]) if is_known else math.nan
-
-
-def fit_curve(track: int, trait: str, sizes: tuple[Floats, Floats, Floats]) -> GrowthCurve:
-    """The model with the least Akaike criterion through (times, values, sds); robust against single dates."""
-    times, values, sds = sizes
-    sds = np.maximum(np.where(np.isfinite(sds), sds, GROWTH.guessed_sd * values), GROWTH.least_sd * values)
-    fits = [_fit(track, trait, model, (times, values, sds)) for model in CURVES]
-    return min(fits, key=lambda fit: fit.criterion)
 
 
 def _plant_rows(tracks: Tracks, points: Sequence[GrowthPoint]) -> Iterator[PlantRow]:
@@ -182,39 +197,3 @@ def _relative_growth(before: Mapping[int, Number], now: Mapping[int, Number], da
     errors = [math.hypot(*(numbers[track].sd for track in both)) for numbers in (before, now)]
     sd = math.hypot(errors[0] / sums[0], errors[1] / sums[1])
     return Number(math.log(sums[1] / sums[0]) / days, sd / days, "1/day")
-
-
-# {model: the sizes at times (T,) by its parameters}, see `GrowthCurve`
-CURVES: dict[str, Callable[[Sequence[float], Floats], Floats]] = {
-    "constant": lambda p, times: np.full(len(times), p[0]),
-    "logistic": lambda p, times: p[0] * np.asarray(expit(p[1] * (times - p[2]))),
-    "expolinear": lambda p, times: p[0] / p[1] * np.logaddexp(0, p[1] * (times - p[2])),
-}
-
-
-def _fit(track: int, trait: str, model: str, sizes: tuple[Floats, Floats, Floats]) -> GrowthCurve:
-    """One model through (times, values, sds), from two starts."""
-    times, values, sds = sizes
-    span, largest, shape = times[-1] - times[0], float(values.max()), CURVES[model]
-    count = 1 if model == "constant" else 3
-    steady = largest if model != "expolinear" else max(float(np.ptp(values)), GROWTH.least_growth * largest) / span
-    (smallest, largest_size), (slowest, fastest) = GROWTH.sizes, GROWTH.rates
-    least = [smallest * steady, slowest / span, times[0] - GROWTH.before * span]
-    most = [largest_size * steady, fastest / span, times[-1] + span]
-    fits = [
-        least_squares(
-            lambda p: (shape(p, times) - values) / sds, (steady, GROWTH.first_rate / span, middle)[:count],
-            loss="soft_l1", bounds=(least[:count], most[:count]), x_scale=(steady, 1 / span, span)[:count],
-        )
-        for middle in [times[0] + share * span for share in GROWTH.middles]
-    ]  # fmt: skip
-    best = min(fits, key=lambda fit: float(fit.cost))
-    information, parameters, errors = best.jac.T @ best.jac, np.full(3, np.nan), np.full(3, np.nan)
-    parameters[:count] = best.x
-    if np.linalg.cond(information) < GROWTH.most_condition:
-        errors[:count] = np.sqrt(np.maximum(np.diag(np.linalg.inv(information)), 0))
-    residual = float(np.sqrt(np.mean(np.square((shape(best.x, times) - values) / sds))))
-    return GrowthCurve(
-        track=track, trait=trait, model=model, parameters=tuple(parameters.tolist()), sds=tuple(errors.tolist()),
-        residual=residual, criterion=2 * float(best.cost) + 2 * count,
-    )  # fmt: skip

@@ -78,29 +78,11 @@ class LinkNumbers:
 
 
 @dataclass(frozen=True)
-class GrowthNumbers:
-    """Curves of growing leaves."""
-
-    least_sd: float = 0.01  # chosen: min. standard deviation of a size, as a share of it: no leaf is measured better
-    guessed_sd: float = 0.05  # chosen: the same of a size whose deviation is not known
-    # limit: bounds of the search: size over the largest one, rate in 1 / span, and days before the first date in spans
-    sizes: tuple[float, float] = (1e-3, 50.0)
-    rates: tuple[float, float] = (0.02, 60.0)  # limit: the same
-    before: float = 5.0  # limit: the same
-    first_rate: float = 4.0  # limit: rate that the search begins with, in 1 / span
-    middles: tuple[float, float] = (-0.5, 0.2)  # limit: days of half growth that it begins with, in spans
-    least_growth: float = 0.02  # limit: min. growth of a curve that begins the search, over the largest size
-    most_condition: float = 1e14  # limit: condition number of an information matrix that is inverted
-    least_dates: int = 5  # chosen: min. dates on which a leaf is measured for a curve, which has three parameters
-
-
-@dataclass(frozen=True)
 class PageNumbers:
     """The page, and its questions."""
 
     most_questions: int = 10  # definition: questions that the user answers
     least_doubt: float = 0.1  # chosen: probability that a link, or its absence, is wrong, below which nobody is asked
-    curve_steps: int = 40  # definition: points of a drawn curve
     side: int = 72  # definition: pixels of a picture of a leaf
     large_side: int = 160  # definition: the same, where links are corrected
     plant_side: int = 120  # definition: pixels of the picture of a plant
@@ -112,5 +94,4 @@ ALIGN = AlignNumbers()
 MOTIONS = MotionNumbers()
 COSTS = CostNumbers()
 LINKING = LinkNumbers()
-GROWTH = GrowthNumbers()
 PAGE = PageNumbers()

@@ -17,8 +17,8 @@ from mvseg.results.overlay import instance_color
 from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
 from mvseg.tracking.dates import Number
-from mvseg.tracking.growth import SIZES, Growth
-from mvseg.tracking.numbers import OBSERVATIONS, PAGE
+from mvseg.tracking.growth import Growth
+from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
@@ -114,19 +114,13 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
 
 
 def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
-    """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}, curves: {trait: {track: {model, line:
-    [[time, value], ...]}}}, and whole: as numbers, of the whole plant, whose track is 0."""
+    """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}; and whole, of the plant, as track 0."""
     numbers: dict[str, dict[str, Any]] = {}
     for point in growth.points:
         of_trait = numbers.setdefault(point.trait, {"unit": point.number.unit, "tracks": {}})
         row = [point.date, _round(point.number.value, 5), _round(point.number.sd, 3) or 0.0]
         of_trait["tracks"].setdefault(str(point.track), []).append(row)
-    times = np.linspace(tracks.dates[0].time, tracks.dates[-1].time, PAGE.curve_steps)
-    curves: dict[str, dict[str, Any]] = {trait: {} for trait in SIZES}
-    for curve in growth.curves:
-        line = [[round(t, 3), _round(v, 5)] for t, v in zip(times.tolist(), curve.at(times).tolist(), strict=True)]
-        curves[curve.trait][str(curve.track)] = {"model": curve.model, "line": line}
-    return {"numbers": numbers, "curves": curves, "whole": _describe_plant(growth)}
+    return {"numbers": numbers, "whole": _describe_plant(growth)}
 
 
 def _describe_plant(growth: Growth) -> dict[str, Any]:

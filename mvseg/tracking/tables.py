@@ -22,9 +22,6 @@ COLUMNS = {
         "plant", "time", "scene", "stem", "node", "leaf", "track",
         *(name + end for name in NODE_NUMBERS for end in ("", "_sd")), "unit",
     ),
-    "curves.csv": (
-        "plant", "track", "trait", "model", "size", "size_sd", "rate", "rate_sd", "middle", "middle_sd", "residual",
-    ),
 }  # fmt: skip
 
 
@@ -52,9 +49,6 @@ def write_track_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
         for node, leaf, own in sorted(nodes, key=lambda each: each[:2]):
             pairs = [(own[name].value, own[name].sd) if name in own else (None, None) for name in NODE_NUMBERS]
             add("nodes.csv", date.written, date.scene, *node, leaf, track_of[index, leaf], *chain(*pairs), date.unit)
-    for curve in growth.curves:
-        found = [number for pair in zip(curve.parameters, curve.sds, strict=True) for number in pair]
-        add("curves.csv", curve.track, curve.trait, curve.model, *found, curve.residual)
     for name, columns in COLUMNS.items():
         write_table(folder / name, columns, rows[name])
 

@@ -41,10 +41,17 @@ class Measurement:
         return bool(np.isfinite(self.value))
 
     def __format__(self, spec: str) -> str:
-        """ "315 +- 8": the value by a format specification, and as many of its digits of the deviation."""
-        if not np.isfinite(self.sd):
-            return format(self.value, spec)
-        return f"{self.value:{spec}} +- {self.sd:.{1 if self.sd >= 1 else 2}g}"
+        """ "1,091 +- 23", see `say_number`; or the value by a format specification."""
+        return format(self.value, spec) if spec else say_number(self.value, self.sd)
+
+
+def say_number(value: float, sd: float) -> str:
+    """A number with two digits of its standard deviation, if that is known; ASCII, since not every terminal knows
+    more."""
+    if not np.isfinite(sd) or sd <= 0:
+        return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
+    decimals = 1 - int(np.floor(np.log10(sd)))
+    return " +- ".join(f"{round(number, decimals):,.{max(decimals, 0)}f}" for number in (value, sd))
 
 
 def missing(reason: str) -> Measurement:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from mvseg.traits.leaf import NEED_UP, Measurement, measure_leaf, measure_voxels
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import find_stems, find_tubes, up_of_stem
+from mvseg.traits.stems import find_stems, find_tubes, tubes_of_masks, up_of_stem
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
@@ -33,6 +34,7 @@ NO_NODE = missing("not measured: leaves and photos show no stem that it sits on"
 GOOD = "good"
 USELESS = {"poor_fit"}  # codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each
 Use = Literal["yes", "look", "no"]
+UpFrom = Literal["scene", "stem", ""]
 NO_MASKS = LeafSurface.none(torch.zeros(0, dtype=torch.int64), "no_masks", "has no masks")
 
 
@@ -47,6 +49,7 @@ class LeafTraits:
         reasons: {code: sentence} of the reasons to doubt the numbers, or why there are none; empty for a good leaf.
         rejection: kind of the reason why it does not count as a leaf, None where it does.
         unit: of its lengths, "" when unknown.
+        probability: that it is a leaf, where the views chose it; None elsewhere.
     """
 
     leaf: int
@@ -55,6 +58,7 @@ class LeafTraits:
     reasons: Mapping[str, str]
     rejection: Kind | None
     unit: str = ""
+    probability: float | None = None
 
     @property
     def quality(self) -> str:
@@ -76,7 +80,7 @@ class LeafTraits:
         if not (area.exists and length.exists):
             return f"leaf {self.leaf}: {self.quality}"
         square, unit = (unit_of(DEFINITIONS[name].kind, self.unit) for name in ("area", "length"))
-        return f"leaf {self.leaf}: {area:.3g} {square}, {length:.3g} {unit} long"
+        return f"leaf {self.leaf}: {area} {square}, {length} {unit} long"
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +93,7 @@ class Traits:
         leaves: one entry per instance, by id.
         whole: {trait: number} of all `PLANT_TRAITS`.
         up: unit vector, None when unknown.
+        up_from: "scene", or "stem" where nothing else tells up; "" when unknown.
         stems: with their nodes, that of the most leaves first.
     """
 
@@ -98,10 +103,16 @@ class Traits:
     whole: Mapping[str, Measurement]
     up: tuple[float, float, float] | None
     stems: tuple[Stem, ...] = ()
+    up_from: UpFrom = ""
+
+    def __repr__(self) -> str:
+        stems = "" if not self.stems else f", {len(self.stems)} stem" + "s" * (len(self.stems) > 1)
+        return f"Traits('{self.plant}': {len(self.leaves)} leaves{stems}, {self.unit or UNKNOWN_UNIT})"
 
     def table(self) -> dict[str, list[Any]]:
         """Columns with a row per leaf, which `pandas.DataFrame` takes: whether to `use` it, the codes of the `doubts`,
-        each trait with its standard deviation, the unit of lengths, the method, and the quality in words."""
+        each trait with its standard deviation, the unit of lengths, the method, the quality in words, and how likely it
+        is a leaf, where the views chose it."""
         columns: dict[str, list[Any]] = {
             "plant": [self.plant] * len(self.leaves),
             "leaf": [leaf.leaf for leaf in self.leaves],
@@ -114,7 +125,8 @@ class Traits:
             if trait.has_sd:
                 columns[f"{trait.name}_sd"] = [number.sd for number in numbers]
         columns["unit"] = [self.unit or UNKNOWN_UNIT] * len(self.leaves)
-        return columns | {name: [getattr(leaf, name) for leaf in self.leaves] for name in ("method", "quality")}
+        names = "method", "quality", "probability"
+        return columns | {name: [getattr(leaf, name) for leaf in self.leaves] for name in names}
 
     @property
     def rejected(self) -> dict[int, Kind]:
@@ -132,6 +144,7 @@ def measure_plant(
     photos: Photos | None = None,
     config: TraitsConfig = TraitsConfig(),
     stems: Collection[int] = (),
+    probabilities: Mapping[int, float] = MappingProxyType({}),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves; on the CPU, wherever the inputs are.
 
@@ -142,6 +155,7 @@ def measure_plant(
         voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
         stems: ids of instances that are stems, as the user says.
+        probabilities: {instance id: how likely it is a leaf}, where the views chose it.
 
     Returns:
         The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
@@ -171,8 +185,8 @@ def measure_plant(
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     plant_stems: tuple[Stem, ...] = ()
     if config.stems == "auto":
-        seen = [each.tube for instance, each in tubes.items()
-                if instance in rejected and rejected[instance].kind == "stem" and each.tube.exists]  # fmt: skip
+        ids = [instance for instance in tubes if instance in rejected and rejected[instance].kind == "stem"]
+        seen = tubes_of_masks(ids, {instance: each.tube for instance, each in tubes.items()}, masks, scene.cameras)
         plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
     tilt_deg = 0.0
     if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
@@ -197,13 +211,26 @@ def measure_plant(
         if instance in voxels and instance not in rejected:
             numbers |= measure_voxels(voxels[instance])
         fitted = None if surfaces is None else surfaces.get(instance, NO_MASKS)
-        leaves.append(
-            describe_leaf(
-                instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
-            )
+        leaf = describe_leaf(
+            instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
         )
-    whole = tilt(measure_whole(blades, frame, num_leaves=len(instances) - len(rejected)), tilt_deg, extent=extent)
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, stems=plant_stems)
+        leaves.append(replace(leaf, probability=probabilities.get(instance)))
+    whole = measure_whole(
+        blades,
+        frame,
+        num_leaves=len(instances) - len(rejected),
+        useless=[leaf.leaf for leaf in leaves if leaf.leaf in blades and leaf.use == "no"],
+    )
+    x, y, z = (0.0, 0.0, 0.0) if frame is None else map(float, frame[2])
+    return Traits(
+        plant=scene.name,
+        unit=scene.unit,
+        leaves=tuple(leaves),
+        whole=tilt(whole, tilt_deg, extent=extent),
+        up=None if frame is None else scene.up or (x, y, z),
+        up_from="" if frame is None else "scene" if scene.up is not None else "stem",
+        stems=plant_stems,
+    )
 
 
 def tilt(numbers: Mapping[str, Measurement], degrees: float, *, extent: float) -> dict[str, Measurement]:

@@ -83,6 +83,7 @@ class Stem:
         source: what showed it: "masks", "photos" or "leaf bases".
         nodes: from the lowest to the highest one.
         phyllotaxis: that they suggest.
+        tells_up: whether the direction in which it grows may be taken for up.
     """
 
     number: int
@@ -90,20 +91,34 @@ class Stem:
     source: str
     nodes: tuple[Node, ...]
     phyllotaxis: Phyllotaxis
+    tells_up: bool = False
+
+    def __repr__(self) -> str:
+        return f"Stem({self.number}: {len(self.nodes)} nodes, from {self.source}, {self.phyllotaxis.name})"
 
 
-def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: str, number: int = 1) -> Stem:
+def measure_stem(
+    tube: Tube,
+    bases: LeafBases,
+    *,
+    frame: Floats | None,
+    source: str,
+    number: int = 1,
+    knows_foot: bool = False,
+    tells_up: bool = False,
+) -> Stem:
     """Order leaves along a stem, and measure their nodes.
 
     Args:
         bases: of the leaves that sit on it.
         frame: (3, 3) rows east, north, up (`level_frame`); None: azimuths start somewhere.
+        knows_foot: heights start where the tube does, not at the lowest node.
     """
     curve = curve_of(tube)
     places, misses, along = project_bases(bases, curve)
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
     reach = np.append(0, steps.cumsum())
-    foot = reach[1] if source == "masks" else float(along.min(initial=np.inf))
+    foot = reach[1] if knows_foot else float(along.min(initial=np.inf))
     tangents = np.stack([np.interp(along, reach, axis) for axis in np.gradient(curve, reach, axis=0).T], 1)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     on_axis = np.stack([np.interp(along, reach, axis) for axis in curve.T], 1)
@@ -126,7 +141,7 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
     angle_sd = np.hypot(np.degrees(turn_sd), ARCH_SD_DEG)
     order = np.lexsort((bases.ids, along))
     # Where heights start from the lowest node, its error is in all of them.
-    start_sd = float(height_sd[order[0]]) if len(order) and source != "masks" else 0.0
+    start_sd = float(height_sd[order[0]]) if len(order) and not knows_foot else 0.0
     nodes: list[Node] = []
     for rank, leaf in enumerate(order.tolist()):
         below = order[rank - 1] if rank else None
@@ -152,7 +167,14 @@ def measure_stem(tube: Tube, bases: LeafBases, *, frame: Floats | None, source: 
                 azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
             )
         )
-    return Stem(number=number, tube=tube, source=source, nodes=tuple(nodes), phyllotaxis=suggest_phyllotaxis(nodes))
+    return Stem(
+        number=number,
+        tube=tube,
+        source=source,
+        nodes=tuple(nodes),
+        phyllotaxis=suggest_phyllotaxis(nodes),
+        tells_up=tells_up,
+    )
 
 
 def thin_tube(places: Sequence[tuple[float, float, float]]) -> Tube:

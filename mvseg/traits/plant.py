@@ -6,7 +6,8 @@ the outermost.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,16 +29,40 @@ FROM_SURFACES = [trait.name for trait in PLANT_TRAITS[1:]]
 
 
 def measure_whole(
-    surfaces: Mapping[int, LeafSurface], frame: Floats | None, *, num_leaves: int
+    surfaces: Mapping[int, LeafSurface],
+    frame: Floats | None,
+    *,
+    num_leaves: int,
+    useless: Collection[int] = (),
 ) -> dict[str, Measurement]:
     """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id.
 
-    `frame` (3, 3) has the rows east, north, up, None where up is not known; `num_leaves` counts those without a
-    surface, too.
+    Args:
+        frame: (3, 3) rows east, north, up; None where up is not known.
+        num_leaves: all leaves, those without a surface, too.
+        useless: ids of leaves whose numbers are not to be used: the total area is without them, and its method says
+            which they are, and their area. They count in the height and in the hull, which would be too small.
     """
     numbers = {"number_of_leaves": Measurement(float(num_leaves), float("nan"), "matching")}
     if not surfaces:
         return numbers | dict.fromkeys(FROM_SURFACES, NO_LEAVES)
+    counted = {leaf: surface for leaf, surface in surfaces.items() if leaf not in useless}
+    numbers |= _measure_surfaces(surfaces, frame, num_leaves=num_leaves)
+    if not counted:
+        numbers["total_leaf_area"] = missing("not measured: the surface of no leaf is to be used")
+    elif len(counted) < len(surfaces):
+        area = _measure_surfaces(counted, frame, num_leaves=num_leaves)["total_leaf_area"]
+        others = ", ".join(str(leaf) for leaf in sorted(surfaces.keys() - counted.keys()))
+        lost = numbers["total_leaf_area"].value - area.value
+        numbers["total_leaf_area"] = replace(area, method=f"{area.method}; left out: {lost:.0f} of {others}")
+    return {trait.name: numbers[trait.name] for trait in PLANT_TRAITS}
+
+
+def _measure_surfaces(
+    surfaces: Mapping[int, LeafSurface], frame: Floats | None, *, num_leaves: int
+) -> dict[str, Measurement]:
+    """The traits of all these surfaces."""
+    numbers: dict[str, Measurement] = {}
     measure = partial(measure_together, up=None if frame is None else frame[2])
     coefficients = torch.stack([surface.coefficients for surface in surfaces.values()])
     slopes = torch.autograd.functional.jacobian(measure, coefficients).flatten(2)  # (T, N, 78)

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from mvseg.errors import warn
+from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.reconstruction.numbers import AXES, TUBE
 from mvseg.reconstruction.spread_views import spread_views
+from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube
 from mvseg.reconstruction.stem.leaf_bases import (
     BaseAxis,
     LeafBases,
@@ -26,6 +31,7 @@ from mvseg.reconstruction.stem.stem_path import StemPath, find_path
 from mvseg.reconstruction.stem.thin_parts import ThinCells, ThinView, find_cells, see_thin, share_of_views
 from mvseg.reconstruction.stem.tube import Tube
 from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
+from mvseg.reconstruction.surface.fit_surfaces import instance_frames, stack_instance
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.traits.nodes import Stem, measure_stem
@@ -40,6 +46,11 @@ LEAF_SHARE = 0.5  # chosen: min. leaves that sit on a path, of all
 UPRIGHT = 0.3  # chosen: length of the mean of the directions that are up in the photos, for them to agree
 FAINTEST = 0.25  # chosen: part of an axis that views need not show
 LEAST_SEEN = 0.3  # chosen: min. part of an axis that enough views see
+UP_LEAVES = 0.8  # chosen: min. share of the leaves on the axis that tells up; two stems in one pot have 0.64
+UP_SEEN = 0.8  # chosen: min. part of that axis that enough views see
+PARALLEL_DEG = 45.0  # chosen: max. bend where two masks of one stem join
+JOINT = 2.0  # chosen: max. gap there, in diameters
+WIDER = 3.0  # chosen: width of an end of a stem, in its usual width, from which the mask holds the pot, too
 LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter ones of seedlings lean by 20 degrees
 
 
@@ -64,7 +75,7 @@ def find_stems(
     *,
     frame: Floats | None,
     photos: Photos,
-    tubes: Sequence[Tube] = (),
+    tubes: Sequence[StemTube] = (),
 ) -> tuple[Stem, ...]:
     """Find the stems that the leaves of a plant sit on, and their nodes.
 
@@ -77,7 +88,7 @@ def find_stems(
         masks: D masks of the scene, with ids.
         frame: (3, 3) rows east, north, up; None: up is not known.
         photos: used, if they exist.
-        tubes: fitted to masks of stems.
+        tubes: fitted to masks of stems, see `tubes_of_masks`.
 
     Returns:
         The stems, that of the most leaves first; none where leaves and views do not agree about one.
@@ -93,13 +104,16 @@ def find_stems(
     if not photos.exist:
         return _of_bases(axes, frame)
     plant = see_plant(surfaces, masks, cameras, photos=photos)
-    axes = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
-    if axes:
-        return _of_bases(axes, frame)
+    shown = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
+    carried = sum(int(axis.is_near.sum()) for axis in shown) / len(surfaces)
+    if shown and carried >= AXES.near_share:  # else what is left of several axes may stand in free air
+        tells_up = len(axes) == 1 and carried >= UP_LEAVES and plant.share_seen(axes[0].tube.points()) >= UP_SEEN
+        return _of_bases(shown, frame, tells_up=tells_up)
     path = find_path(plant.cells, plant.leaves)
     if path is None or plant.support(path.points) < SUPPORTED:
         return ()
-    return _of_path(path, surfaces, frame, upward)
+    stems = _of_path(path, surfaces, frame, upward)
+    return stems if upward is None else tuple(stem for stem in stems if _rises(stem.tube, upward))
 
 
 def find_upward(cameras: Cameras) -> Floats | None:
@@ -110,9 +124,9 @@ def find_upward(cameras: Cameras) -> Floats | None:
 
 def up_of_stem(stems: Sequence[Stem], surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Floats | None:
     """(3,) the direction in which the only stem of a plant grows, as long as a leaf or longer, and upwards in the
-    photos; None without one."""
+    photos, if masks or photos show it (`Stem.tells_up`); None without one."""
     upward = find_upward(cameras)
-    if len(stems) != 1 or upward is None:
+    if len(stems) != 1 or upward is None or not stems[0].tells_up:
         return None
     first, last = stems[0].tube.points()[[0, -1]]
     length = float(np.linalg.norm(last - first))
@@ -148,6 +162,10 @@ class SeenPlant:
         is_seen = np.isfinite(shares)
         return float(np.quantile(shares[is_seen], FAINTEST)) if is_seen.mean() > LEAST_SEEN else 0.0
 
+    def share_seen(self, points: Floats) -> float:
+        """Part of an axis (P, 3) that enough views see."""
+        return float(np.isfinite(share_of_views(self.views, points, 3 * self.cells.size)).mean())
+
 
 def see_plant(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos) -> SeenPlant:
     """Look for thin parts around the leaves, in some of the photos."""
@@ -163,21 +181,93 @@ def see_plant(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Camera
     return SeenPlant(tuple(views), find_cells(views, points, axes), leaves)
 
 
+@dataclass(frozen=True, eq=False)
+class StemTube:
+    """A tube that masks of a stem show; `knows_foot`: it begins where the stem leaves the soil."""
+
+    tube: Tube
+    knows_foot: bool
+
+
+def tubes_of_masks(
+    stems: Collection[int], tubes: Mapping[int, Tube], masks: Masks, cameras: Cameras
+) -> tuple[StemTube, ...]:
+    """The tubes of instances that are stems. Masks that were drawn for each internode are one stem: those of which an
+    end meets another one's are fitted together. Warns (InputWarning) of masks that hold the pot, too: the foot of such
+    a stem is not known.
+
+    Args:
+        stems: ids of the instances.
+        tubes: {id: tube} of all of them.
+        masks: D masks of the scene, with ids.
+    """
+    regions, cameras, joined = masks.regions.to("cpu"), cameras.to("cpu"), []
+    for ids in _join_ends({stem: tubes[stem] for stem in sorted(stems) if tubes[stem].exists}):
+        of_stem = torch.isin(masks.instance_ids.cpu(), torch.tensor(ids)) & (regions.areas > 0)
+        whole = torch.where(of_stem, ids[0], masks.instance_ids.cpu())
+        members = regions.select(of_stem)
+        if len(members.view_index.unique()) < 2:
+            continue
+        stack = stack_instance(members, cameras, instance_frames(regions, whole, cameras), instance=ids[0])
+        fitted = tubes[ids[0]] if len(ids) == 1 else fit_tube(stack)
+        if not fitted.exists or (len(ids) > 1 and float(np.median(fitted.iou)) < SUPPORTED):
+            joined += [StemTube(tubes[stem], knows_foot=len(ids) == 1) for stem in ids]
+            continue
+        has_pot = _is_wider_at_an_end(apparent_widths(stack, fitted.axis)[0])
+        if has_pot:
+            warn(Finding("stem_with_pot", values={"stem": ids[0]}))
+        joined.append(StemTube(fitted, knows_foot=not has_pot))
+    return tuple(joined)
+
+
+def _join_ends(tubes: Mapping[int, Tube]) -> list[list[int]]:
+    """Ids of tubes, those in a list that continue each other; each end meets one other end."""
+    ends = {(stem, end): tube.points()[[-end, end - 1]] for stem, tube in tubes.items() for end in (0, 1)}
+    pairs = []
+    for one, other in combinations(ends, 2):
+        (far, near), (beyond, start) = ends[one], ends[other]  # from the far end of the first to that of the other
+        ways = np.stack([near - far, beyond - start])
+        ways = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-12)
+        gap = float(np.linalg.norm(start - near))
+        is_straight = ways[0] @ ways[1] >= np.cos(np.radians(PARALLEL_DEG))
+        if one[0] != other[0] and is_straight and gap <= JOINT * max(tubes[one[0]].diameter, tubes[other[0]].diameter):
+            pairs.append((gap, one, other))
+    used: set[tuple[int, int]] = set()
+    group = {stem: [stem] for stem in tubes}
+    for _, one, other in sorted(pairs):
+        if not {one, other} & used and group[one[0]] is not group[other[0]]:
+            used |= {one, other}
+            both = group[one[0]] + group[other[0]]
+            group |= dict.fromkeys(both, both)
+    return [list(each) for each in dict.fromkeys(tuple(sorted(each)) for each in group.values())]
+
+
+def _is_wider_at_an_end(widths: Floats) -> bool:
+    """Whether views show a quarter of a stem, from one of its ends on, far wider than the rest; `widths` (S, M)."""
+    of_place = np.array([np.nan if np.isnan(each).all() else np.nanmedian(each) for each in widths.T])
+    quarter = len(of_place) // 4
+    for side in (of_place, of_place[::-1]):
+        end, rest = side[:quarter], side[quarter:]
+        if np.isfinite(end).any() and np.isfinite(rest).any() and np.nanmax(end) > WIDER * np.nanmedian(rest):
+            return True
+    return False
+
+
 def _of_tubes(
-    tubes: Sequence[Tube], surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
+    tubes: Sequence[StemTube], surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
 ) -> tuple[Stem, ...]:
     """The stems that masks show, each with the leaves that point back to it rather than to another one."""
     ends, others = find_ends(surfaces)
     size = float(np.median(ends.lengths))
-    upright = [tube.reverse() if _is_reversed(tube, upward, ends) else tube for tube in tubes]
+    upright = [each.tube.reverse() if _is_reversed(each.tube, upward, ends) else each.tube for each in tubes]
     nearer = [choose_ends(ends, others, curve_of(tube)) for tube in upright]
     gaps = np.array([project_bases(bases, curve_of(tube))[1] for bases, tube in zip(nearer, upright, strict=True)])
     of_leaf = np.where(gaps.min(0) < AXES.near * size, gaps.argmin(0), -1)
     own = [bases.select(of_leaf == number) for number, bases in enumerate(nearer)]
-    found = sorted(zip(upright, own, strict=True), key=lambda each: -len(each[1]))
+    ordered = sorted(zip(upright, own, tubes, strict=True), key=lambda each: -len(each[1]))
     return tuple(
-        measure_stem(tube, bases, frame=frame, source="masks", number=number)
-        for number, (tube, bases) in enumerate(found, start=1)
+        measure_stem(tube, bases, frame=frame, source="masks", number=number, knows_foot=each.knows_foot, tells_up=True)
+        for number, (tube, bases, each) in enumerate(ordered, start=1)
         if len(bases)
     )
 
@@ -191,10 +281,13 @@ def _is_reversed(tube: Tube, upward: Floats | None, leaves: LeafBases) -> bool:
     return below < above
 
 
-def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None) -> tuple[Stem, ...]:
+def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None, *, tells_up: bool = False) -> tuple[Stem, ...]:
     """The stems of axes; a leaf sits on one of them."""
+    source = "leaf bases"
     return tuple(
-        measure_stem(axis.tube, axis.bases.select(axis.is_near), frame=frame, source="leaf bases", number=number)
+        measure_stem(
+            axis.tube, axis.bases.select(axis.is_near), frame=frame, source=source, number=number, tells_up=tells_up
+        )
         for number, axis in enumerate(axes, start=1)
     )
 

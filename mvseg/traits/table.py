@@ -11,7 +11,7 @@ from mvseg.errors import InputError
 from mvseg.formats.text_file import read_table, write_table
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
-from mvseg.traits.measure import GOOD, LeafTraits, Traits
+from mvseg.traits.measure import GOOD, LeafTraits, Traits, UpFrom
 from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
@@ -43,10 +43,9 @@ def write_long(path: Path, traits: Traits) -> None:
     write_table(path, COLUMNS, rows)
 
 
-def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = MappingProxyType({})) -> None:
-    """One row per leaf, see `Traits.table`; and how likely it is a leaf, where the views chose it."""
+def write_wide(path: Path, traits: Traits) -> None:
+    """One row per leaf, see `Traits.table`."""
     columns = traits.table()
-    columns["probability"] = [probabilities.get(leaf) for leaf in columns["leaf"]]
     write_table(path, list(columns), list(zip(*columns.values(), strict=True)))
 
 
@@ -102,7 +101,7 @@ def _number(text: str) -> float:
 
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
-    return [*Traits(plant="", unit="", leaves=(), whole={}, up=None).table(), "probability"]
+    return [*Traits(plant="", unit="", leaves=(), whole={}, up=None).table()]
 
 
 def read_traits(
@@ -113,6 +112,7 @@ def read_traits(
     plant: str,
     unit: str,
     up: tuple[float, float, float] | None,
+    up_from: UpFrom = "",
     rejected: Mapping[int, Kind] = MappingProxyType({}),
 ) -> Traits:
     """The traits that `write_long`, `write_wide` and `write_nodes` wrote, with six digits; what the tables do not say
@@ -136,7 +136,7 @@ def read_traits(
         raise InputError(f"{long}: is no table of traits that mvseg wrote ({error})") from None
     whole = {name: number for name, number in numbers[0].items() if name in DEFINITIONS}  # others are of older versions
     stems = () if nodes is None else read_nodes(nodes)
-    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up, stems=stems)
+    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=whole, up=up, stems=stems, up_from=up_from)
 
 
 def _read_leaf(
@@ -153,6 +153,7 @@ def _read_leaf(
         reasons=dict(zip(codes, texts, strict=False)),
         rejection=rejection,
         unit=unit,
+        probability=float(row["probability"]) if row.get("probability") else None,
     )
 
 

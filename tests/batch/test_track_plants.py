@@ -117,7 +117,7 @@ def test_tables_of_many_plants_are_those_of_each_one_below_the_other(tmp_path: P
     batch = write_batch(tmp_path / "batch", rows)
     track_plants(list_plants(batch)[0], tmp_path / "all", report=False)
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == [
-        "curves.csv", "growth.csv", "nodes.csv", "plants.csv", "run.json", "tracks.csv",
+        "growth.csv", "nodes.csv", "plants.csv", "run.json", "tracks.csv",
     ]  # fmt: skip
     for plant in list_plants(batch)[0]:
         track_plants([plant], tmp_path / plant.plant, report=False)

@@ -62,7 +62,7 @@ def test_the_cause_that_mends_it_is_named(change: Callable[[Floats, int], Floats
 
 
 def test_a_fisheye() -> None:
-    """Ten photos of points around, up to 65 degrees off the axis, which a lens with radial distortion cannot bend so."""
+    """Ten photos of points around, up to 65 degrees off the axis: a lens with radial distortion cannot bend so."""
     rng, model = np.random.default_rng(0), pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=1024, height=768, params=[400, *MIDDLE, 0], camera_id=1)
     model.add_camera_with_trivial_rig(camera)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -72,12 +73,17 @@ def test_codes_of_the_card_have_sentences() -> None:
 def test_doubtful_shapes_are_named_and_an_area_has_the_digits_that_are_known(result: Result) -> None:
     area = SimpleNamespace(value=8484.2, sd=159.4, exists=True)
     whole = {"total_leaf_area": area, "number_of_leaves": SimpleNamespace(value=9.0)}
-    traits = SimpleNamespace(whole=whole, unit="mm")
+    poor = SimpleNamespace(use="no", rejection=None, numbers={"area": SimpleNamespace(value=1200.0)})
+    stem = SimpleNamespace(use="no", rejection="stem", numbers={"area": SimpleNamespace(value=math.nan)})
+    traits = SimpleNamespace(whole=whole, unit="mm", rejected={7: "stem", 9: "short"}, leaves=[poor, stem])
     measured = replace(
         result,
         instances=Instances(traits=traits),  # type: ignore[arg-type]
         findings=(Finding("doubtful_shapes", values={"count": 2, "total": 12, "leaves": ("2", "8")}, level="note"),),
     )
     card = make_card(measured, OUT)
-    assert card.summary == "12 leaves in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2"
+    assert card.summary == (
+        "11 leaves and 1 stem in 9 photos, 9 of which count in the plant's traits; total area 8,480 +- 160 mm^2, "
+        "without 1 leaf of 1,200 mm^2 that fit badly"
+    )
     assert str(card.doubt) == "the shapes of 2 of 12 leaves are doubtful (2, 8): the page says why"

@@ -1,9 +1,8 @@
-"""Growth: rates with their standard deviations, curves of known parameters, the plant as a whole."""
+"""Growth: rates with their standard deviations, and the plant as a whole."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import pytest
 
 from mvseg.tracking.dates import Number, PlantOnDate
 from mvseg.tracking.growth import measure_growth, slope
-from mvseg.tracking.track import TrackRow, Tracks
+from mvseg.tracking.track import TrackRow, Tracks, track_leaves
 from tests.plants_over_days import grow_blades, see
 
 
@@ -44,34 +43,29 @@ def test_points_carry_the_numbers_of_the_results() -> None:
     assert [point.rate for point in points] == pytest.approx([20] * 3)
 
 
-@pytest.mark.parametrize(
-    ("model", "curve"),
-    [
-        ("logistic", lambda t: 900 / (1 + np.exp(-0.7 * (t - 6)))),
-        ("expolinear", lambda t: 60 / 0.9 * np.log1p(np.exp(0.9 * (t - 3)))),
-        ("constant", lambda t: np.full_like(t, 500.0)),
-    ],
-)
-def test_curves_of_known_parameters(model: str, curve: Callable[[np.ndarray], np.ndarray]) -> None:
-    times = np.arange(0, 13, 1.5)
-    (found,) = measure_growth(one_leaf(curve(times).tolist(), times.tolist())).curves
-    assert found.model == model
-    np.testing.assert_allclose(found.at(times), curve(times), rtol=0.03, atol=3)
-    if model == "logistic":
-        assert found.parameters == pytest.approx((900, 0.7, 6), rel=0.02)
-        assert 0 < found.sds[0] < 30
+@pytest.mark.parametrize("goes", [False, True])
+def test_no_height_grows_because_the_lowest_leaf_is_lost(goes: bool) -> None:
+    """Nothing grows, and the pot is turned: heights start from another leaf, which is no growth."""
+    blades = grow_blades(8, 3)
+    lowest = min(blades, key=lambda leaf: blades[leaf].reshape(-1, 3)[:, 2].min())
 
+    def on(time: float, left: dict[int, np.ndarray]) -> PlantOnDate:
+        date, _ = see(left, time, turn=40 * time)
+        ground = min(blade.reshape(-1, 3)[:, 2].min() for blade in left.values())
+        heights = [Number(float(np.asarray(leaf.midrib)[0, 2] - ground), 0.2, "mm") for leaf in date.leaves]
+        leaves = [replace(leaf, numbers={**leaf.numbers, "insertion_height": height})
+                  for leaf, height in zip(date.leaves, heights, strict=True)]  # fmt: skip
+        return replace(date, leaves=tuple(leaves), up_from="scene")
 
-def test_one_wrong_date_does_not_bend_a_curve() -> None:
-    times = np.arange(0, 13, 1.5)
-    areas = 900 / (1 + np.exp(-0.7 * (times - 6)))
-    areas[6] *= 0.5
-    (found,) = measure_growth(one_leaf(areas.tolist(), times.tolist())).curves
-    assert found.parameters[0] == pytest.approx(900, rel=0.06)
-
-
-def test_few_dates_get_no_curve() -> None:
-    assert measure_growth(one_leaf([1, 2, 3, 4], [0, 1, 2, 3])).curves == ()
+    rest = {leaf: blade for leaf, blade in blades.items() if leaf != lowest or not goes}
+    tracks = track_leaves([on(0, blades), on(2, blades), on(4, rest), on(6, rest)])
+    points = [point for point in measure_growth(tracks).points if point.trait == "insertion_height"]
+    assert len(points) == (30 if goes else 32)
+    rates = [point.rate for point in points if not math.isnan(point.rate)]
+    assert len(rates) >= 28
+    assert np.abs(rates).max() < 0.05
+    least = min(point.number.value for point in points)
+    assert (least < -1e-6) == goes  # the leaf that went was below the one that heights start from
 
 
 def test_the_plant_grows() -> None:

@@ -40,6 +40,18 @@ def test_it_agrees_with_meshes() -> None:
     assert found["height"].value == pytest.approx(np.ptp(whole.vertices[:, 2]))
 
 
+def test_the_total_is_without_leaves_that_fit_badly_and_says_so() -> None:
+    leaves = some_leaves()
+    every, some = measure(leaves), measure_whole(leaves, FRAME, num_leaves=3, useless=[2])
+    lost = measure_leaf(leaves[2], FRAME)["area"].value
+    assert some["total_leaf_area"].value == pytest.approx(every["total_leaf_area"].value - lost, rel=1e-6)
+    assert some["total_leaf_area"].method == f"surface (2 of 3 leaves); left out: {lost:.0f} of 2"
+    assert some["height"] == every["height"]
+    none = measure_whole(leaves, FRAME, num_leaves=3, useless=[*leaves])
+    assert not none["total_leaf_area"].exists
+    assert [*none] == [*every]
+
+
 def test_numbers_and_deviations_do_not_depend_on_the_worlds_origin() -> None:
     leaves = some_leaves()
     far = {i: move(leaf, np.eye(3), shift=(1e7, -1e7, 1e7)) for i, leaf in leaves.items()}

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -20,10 +21,11 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import regions_from_label_maps
 from mvseg.traits.measure import Traits
 from mvseg.traits.nodes import Stem
-from mvseg.traits.stems import find_stems, up_of_stem
+from mvseg.traits.stems import StemTube, find_stems, tubes_of_masks, up_of_stem
 from mvseg.traits.table import read_nodes, write_nodes
 from mvseg.traits.up import level_frame
 from tube_scene import BENT, T, stack, tube_masks
+from warned import warns_of
 
 UP = np.array([0.0, 0.0, 1.0])
 CAMERAS = ring_cameras(8, distance=600.0)
@@ -32,6 +34,9 @@ PETIOLE = 9.0
 
 class NoPhotos:
     exist = False
+
+
+NO_PHOTOS = NoPhotos()
 
 
 def leaf_at(height: float, azimuth: float, *, petiole: float = PETIOLE, x: float = 0.0) -> LeafSurface:
@@ -45,10 +50,12 @@ def plant_of(azimuths: Callable[[int], float], heights: Callable[[int], float]) 
     return {(5 * n) % 11 + 1: leaf_at(heights(n), azimuths(n)) for n in range(8)}
 
 
-def stems_of(leaves: dict[int, LeafSurface], up: np.ndarray | None = UP) -> tuple[Stem, ...]:
+def stems_of(
+    leaves: dict[int, LeafSurface], up: np.ndarray | None = UP, photos: object = NO_PHOTOS
+) -> tuple[Stem, ...]:
     regions = regions_from_label_maps([np.zeros((SIZE, SIZE), np.int64)] * len(CAMERAS))
     frame = None if up is None else level_frame(up)
-    return find_stems(leaves, Masks.of(regions), CAMERAS, frame=frame, photos=NoPhotos())  # type: ignore[arg-type]
+    return find_stems(leaves, Masks.of(regions), CAMERAS, frame=frame, photos=photos)  # type: ignore[arg-type]
 
 
 PLANTS = {
@@ -143,17 +150,43 @@ def test_a_stem_rises_more_than_it_runs_aside() -> None:
         assert len(stems_of(turned)) == num_stems
 
 
+class Drawn:
+    """Photos of dark vertical lines, each at an x."""
+
+    exist = True
+
+    def __init__(self, *lines: float) -> None:
+        self.lines = [np.stack([x + 0 * T, 0 * T, 150 * T - 5], 1) for x in lines]
+
+    def __call__(self, view: int) -> np.ndarray:
+        return draw_lines(self.lines, 3, CAMERAS.px_from_world.numpy()[view])
+
+
 @pytest.mark.parametrize("lean", [0, 20])
-def test_where_nothing_else_says_which_way_is_up_the_stem_does(lean: float) -> None:
+def test_where_nothing_else_says_which_way_is_up_a_stem_does_that_is_shown(lean: float) -> None:
     turn = turn_about(np.array([1.0, 0, 0]), lean)
     leaves = {leaf: move(surface, turn) for leaf, surface in PLANTS["spiral"][1].items()}
     stems = stems_of(leaves, None)
-    up = up_of_stem(stems, leaves, CAMERAS)
+    assert up_of_stem(stems, leaves, CAMERAS) is None  # of leaf bases alone
+    shown = tuple(replace(stem, tells_up=True) for stem in stems)
+    up = up_of_stem(shown, leaves, CAMERAS)
     assert up is not None
     assert up @ (turn @ UP) > np.cos(np.radians(3))
-    assert up_of_stem((*stems, *stems), leaves, CAMERAS) is None
+    assert up_of_stem((*shown, *shown), leaves, CAMERAS) is None
     long = {leaf: move(surface, np.eye(3), scale=10) for leaf, surface in leaves.items()}
-    assert up_of_stem(stems, long, CAMERAS) is None
+    assert up_of_stem(shown, long, CAMERAS) is None
+
+
+def test_of_two_stems_in_one_pot_the_one_that_is_shown_tells_no_up() -> None:
+    one = PLANTS["spiral"][1]
+    (alone,) = stems_of(one, None, Drawn(0.0))
+    assert alone.tells_up
+    assert stems_of(one, None, Drawn(300.0)) == ()  # through free air
+    two = one | {leaf + 20: move(surface, np.eye(3), shift=(180.0, 0, 0)) for leaf, surface in one.items()}
+    for lines in ((0.0, 180.0), (0.0,)):
+        stems = stems_of(two, None, Drawn(*lines))
+        assert len(stems) == len(lines)
+        assert not any(stem.tells_up for stem in stems)
 
 
 def test_masks_of_stems_tell_better_than_leaves() -> None:
@@ -171,14 +204,35 @@ def test_masks_of_stems_tell_better_than_leaves() -> None:
         Masks.of(regions),
         cameras,
         frame=level_frame(UP),
-        photos=NoPhotos(),
-        tubes=[tube.reverse()],  # type: ignore[arg-type]
+        photos=NO_PHOTOS,
+        tubes=[StemTube(tube.reverse(), knows_foot=True)],  # type: ignore[arg-type]
     )
     assert stem.source == "masks"
+    assert stem.tells_up
     assert [node.leaf for node in stem.nodes] == [1, 2, 3]
     along = np.append(0, np.linalg.norm(np.diff(BENT, axis=0), axis=1).cumsum())
     assert [node.height.value for node in stem.nodes] == pytest.approx(along[[20, 32, 44]], abs=0.04)
     assert stem.tube.points()[0, 2] < stem.tube.points()[-1, 2]
+
+
+@pytest.mark.parametrize("case", ["whole", "internodes", "pot"])
+def test_masks_of_internodes_are_one_stem_and_a_pot_is_no_foot(case: str) -> None:
+    cameras, thirds = ring_cameras(10), [slice(22), slice(20, 43), slice(41, 64)]
+    parts = thirds if case == "internodes" else [slice(None)]
+    radius = 0.06 * np.where((T < 0.15) & (case == "pot"), 9, 1)
+    drawn = [tube_masks(BENT[part], radius[part]) for part in parts]
+    maps = [np.select(views, range(1, len(parts) + 1)) for views in zip(*drawn, strict=True)]
+    regions = regions_from_label_maps([each.astype(np.int64) for each in maps])
+    masks = replace(Masks.of(regions), instance_ids=regions.labels)
+    tubes = {number: fit_tube(stack(each, cameras)) for number, each in enumerate(drawn, start=1)}
+    if case == "pot":
+        with warns_of("stem_with_pot"):
+            (joined,) = tubes_of_masks(tubes, tubes, masks, cameras)
+    else:
+        (joined,) = tubes_of_masks(tubes, tubes, masks, cameras)
+        length = float(np.linalg.norm(np.diff(BENT, axis=0), axis=1).sum())
+        assert joined.tube.length == pytest.approx(length, rel=0.06)
+    assert joined.knows_foot == (case != "pot")
 
 
 def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -201,15 +255,16 @@ def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
 
 def thin_photos(lines: list[np.ndarray], width: int) -> list[np.ndarray]:
     """V photos (H, W, 3) of dark lines (P, 3) before grey."""
-    photos = []
-    for matrix in ring_cameras(10).px_from_world.numpy():
-        photo = np.full((SIZE, SIZE, 3), 150, np.uint8)
-        for line in lines:
-            cam = line @ matrix[:, :3].T + matrix[:, 3]
-            px = np.round(cam[:, :2] / cam[:, 2:] * 16 - 8).astype(np.int32)
-            cv2.polylines(photo, [px], False, (70, 90, 40), width, shift=4)
-        photos.append(photo)
-    return photos
+    return [draw_lines(lines, width, matrix) for matrix in ring_cameras(10).px_from_world.numpy()]
+
+
+def draw_lines(lines: list[np.ndarray], width: int, px_from_world: np.ndarray) -> np.ndarray:
+    photo = np.full((SIZE, SIZE, 3), 150, np.uint8)
+    for line in lines:
+        cam = line @ px_from_world[:, :3].T + px_from_world[:, 3]
+        px = np.round(cam[:, :2] / cam[:, 2:] * 16 - 8).astype(np.int32)
+        cv2.polylines(photo, [px], False, (70, 90, 40), width, shift=4)
+    return photo
 
 
 def test_a_path_through_thin_parts_joins_leaves_to_their_stem() -> None:

@@ -94,7 +94,9 @@ def test_wide_form(tmp_path: Path) -> None:
     begin = ["plant", "leaf", "use", "doubts", "area", "area_sd", "length", "length_sd", "width", "width_sd"]
     assert [*first][:12] == [*begin, "length_width_ratio", "length_width_ratio_sd"]
     assert [*first][-6:] == ["sure_views", "iou", "unit", "method", "quality", "probability"]
-    write_wide(tmp_path / "chosen.csv", traits_of(), {2: 0.75})
+    first, second = traits_of().leaves
+    leaves = first, replace(second, probability=0.75)
+    write_wide(tmp_path / "chosen.csv", traits_of(leaves=leaves))
     assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
     assert (first["leaf"], first["use"], first["doubts"], first["quality"]) == ("1", "yes", "", "good")
     assert (second["leaf"], second["use"], second["doubts"]) == ("2", "no", "first; second")
@@ -175,5 +177,8 @@ def test_columns_and_lines_of_a_leaf() -> None:
     assert columns["area"][0] == traits.leaves[0].numbers["area"].value
     numbers = traits.leaves[0].numbers | {"area": Measurement(315.2, 8.1, ""), "length": Measurement(27.06, 0.61, "")}
     leaf = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons={}, rejection=None, unit="mm")
-    assert repr(leaf) == "leaf 1: 315 +- 8 mm^2, 27.1 +- 0.61 mm long"
+    assert repr(leaf) == "leaf 1: 315.2 +- 8.1 mm^2, 27.06 +- 0.61 mm long"
+    large = replace(leaf, numbers=numbers | {"area": Measurement(1568.4, 21.3, "")})
+    assert repr(large) == "leaf 1: 1,568 +- 21 mm^2, 27.06 +- 0.61 mm long"
+    assert repr(traits) == "Traits('basil': 2 leaves, mm)"
     assert repr(traits.leaves[1]) == f"leaf 2: {traits.leaves[1].quality}"

@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.find_starts import area_cost, find_starts, wid
 from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patch, fit_patches
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, cell_normals, measure_sizes
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
@@ -109,7 +109,7 @@ def fit_surfaces(
         nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
         surfaces[instance] = cache.surfaces[names[instance]] if instance in names else nothing
     oriented = orient_surfaces(dict(sorted(surfaces.items())), cameras)
-    return {n: cache.orient(names[n], each) if n in names else each for n, each in oriented.items()}
+    return ByInstance((n, cache.orient(names[n], each) if n in names else each) for n, each in oriented.items())
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ import trimesh
 from torch import Tensor
 
 from mvseg.crop import Crop
+from mvseg.findings.finding import list_some
 from mvseg.reconstruction.numbers import DOUBTS, FIT
 from mvseg.reconstruction.surface.leaf_patch import (
     MIDRIB,
@@ -26,6 +27,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
+T = TypeVar("T")
 MESH_SHAPE = (64, 17)  # definition: a mesh has so many rows and columns of vertices
 
 # Codes of reasons with which areas are as good as without (`python benchmarks/traits.py`, docs/traits.md).
@@ -51,6 +53,13 @@ class Quality:
     def is_harmless(self) -> bool:
         """Whether there is no reason to doubt its area (`HARMLESS`)."""
         return self.reasons.keys() <= HARMLESS
+
+
+class ByInstance(dict[int, T]):
+    """{instance id: shape}; a KeyError says which ids there are."""
+
+    def __missing__(self, instance: int) -> T:
+        raise KeyError(f"there is no instance {instance}, expected one of {list_some([str(each) for each in self])}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +89,11 @@ class LeafSurface:
     quality: Quality
     offsets_px: Tensor = field(default_factory=partial(torch.zeros, 0, dtype=torch.float64))
     _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
+
+    def __repr__(self) -> str:
+        why = "; ".join(self.quality.reasons.values()) or "good"
+        sizes = f"area {self.area:.4g}, length {self.length:.4g}, {len(self.views)} views; " if self.exists else ""
+        return f"LeafSurface({sizes}{why})"
 
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: not what it looks like, which follows from the rest."""

@@ -79,6 +79,7 @@ def describe_space(result: Result) -> dict[str, Any]:
         "grid": grid_step(frame.radius),
         "radius": frame.radius,
         "isUpKnown": frame.is_up_known,
+        "upFrom": "" if result.traits is None else result.traits.up_from,
     }
 
 

@@ -192,12 +192,10 @@ function drawChart() {
   svg("text", { x: left, y: 12 }, trait.replaceAll("_", " ") + (of.unit ? ` (${withUnit("", of.unit).trim()})` : "") + " \u00b1 1 sd");
   for (const [track, points] of shown) {
     const at = points.map(([date, value, sd]) => [x(data.dates[date].time), y(value - sd), y(value + sd), y(value)]);
-    const color = data.colors[track] || "currentColor", curve = (data.curves[trait] || {})[track];
+    const color = data.colors[track] || "currentColor";
     const band = [...at.map((p) => `${p[0]},${p[1]}`), ...[...at].reverse().map((p) => `${p[0]},${p[2]}`)];
     svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.12 });
-    const within = (point) => point[0] >= data.dates[points[0][0]].time && point[0] <= data.dates[points.at(-1)[0]].time;
-    const line = curve ? curve.line.filter(within).map((p) => `${x(p[0])},${y(p[1])}`) : at.map((p) => `${p[0]},${p[3]}`);
-    svg("polyline", { points: line.join(" "), fill: "none", stroke: color, "stroke-width": 2 });
+    svg("polyline", { points: at.map((p) => `${p[0]},${p[3]}`).join(" "), fill: "none", stroke: color, "stroke-width": 2 });
     const born = data.leaves.find((leaf) => leaf.track === Number(track) && leaf.state === "born");
     at.forEach((p, n) => {
       const isNew = born && born.date === points[n][0] && born.date > 0;
@@ -209,7 +207,6 @@ function drawChart() {
       svg("path", { d: `M${at.at(-1)[0]},${py}L${px},${py}`, stroke: color, "stroke-dasharray": "2 4" });
       svg("path", { d: `M${px - 4},${py - 4}l8,8m0,-8l-8,8`, stroke: color, "stroke-width": 2, class: "gone" });
     }
-    if (curve && picked) find("model").textContent = `curve: ${curve.model}`;
   }
 }
 

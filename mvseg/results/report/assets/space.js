@@ -177,7 +177,8 @@ function buildSpace(data, addresses) {
 
 function describeSpace(data) {
   const squares = `Squares on the ground: ${Number(data.space.grid.toPrecision(6))} ${data.unit}.`;
-  const up = data.space.isUpKnown ? "" : " Which way is up is not known; most photos have their upper side up.";
+  const ofStem = data.space.upFrom === "stem" ? " Heights and angles are along the stem." : "";
+  const up = data.space.isUpKnown ? "" : ` Which way is up is not known; most photos have their upper side up.${ofStem}`;
   const hasLeaves = Object.keys(data.space.leaves).length > 0;
   return (hasLeaves ? "" : "Cameras only: there are no shapes in 3D. ") + squares + up;
 }

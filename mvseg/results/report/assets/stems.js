@@ -13,7 +13,7 @@ function drawStem({ path, leaf }) {
 
 function describeStem(stem, data) {
   const angle = stem.name === "spiral" ? ` of ${stem.angle}°` : "";
-  const chance = stem.probability === undefined ? "" : ` (probability ${stem.probability.toFixed(2)})`;
+  const chance = stem.probability === undefined || stem.name === "unclear" ? "" : ` (probability ${stem.probability.toFixed(2)})`;
   const note = `Found by ${stem.source}; ${stem.name}${angle}${chance}. Petioles are guessed.`;
   const title = `Stem ${stem.number}: height (${data.unit}) against azimuth`;
   return [element("h3", {}, title), element("p", { class: "note" }, note), drawNodes(stem.nodes, data, title)];
