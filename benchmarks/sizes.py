@@ -40,12 +40,11 @@ from mvseg.verification.leaf_scores import order_ratings
 def cut_photos(folder: Path, out: Path) -> Path:
     """A copy of a scene with a rig file: the middle third of each photo, and of its true labels."""
     rig = json.loads((folder / "cameras.json").read_text())
-    for place in ("images", "truth"):
-        (out / place).mkdir(parents=True, exist_ok=True)
     for view in rig["views"]:
         name, x, y = f"{Path(view['file']).stem}.png", view["width"] // 3, view["height"] // 3
         for source, place in ((folder / view["file"], "images"), (folder / "truth" / name, "truth")):
             if source.is_file():
+                (out / place).mkdir(parents=True, exist_ok=True)
                 image = np.asarray(cv2.imread(str(source), cv2.IMREAD_UNCHANGED))
                 cv2.imwrite(str(out / place / name), image[y : image.shape[0] - y, x : image.shape[1] - x])
         view |= {"file": f"images/{name}", "width": view["width"] - 2 * x, "height": view["height"] - 2 * y}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import json
 from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -22,6 +23,7 @@ from mvseg.training.config import TrainConfig
 from mvseg.traits.config import TraitsConfig, Up
 
 DEFAULT_OUT = Path("results")
+CAN_BE_OFF = ("stems", "crop", "learn")  # options with that word
 # an installed mvseg carries configs/ inside the package, a checkout has it beside the package
 CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
 Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, PoseConfig)
@@ -43,8 +45,18 @@ class CheckedConfig(ActionConfigFile):
 
     def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
         path = find_config(str(values))
-        read_yaml(path, "a YAML file of options")
-        super().__call__(parser, cfg, str(path), option_string)
+        content = read_yaml(path, "a YAML file of options")
+        words = _with_words(content)
+        super().__call__(parser, cfg, str(path) if words == content else json.dumps(words), option_string)
+
+
+def _with_words(options: Any) -> Any:
+    """The same options with "off" in place of false, which YAML makes of off, where that is a choice."""
+    if not isinstance(options, dict):
+        return options
+    return {
+        name: "off" if each is False and name in CAN_BE_OFF else _with_words(each) for name, each in options.items()
+    }
 
 
 def find_config(name: str) -> Path:

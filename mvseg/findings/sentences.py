@@ -19,7 +19,10 @@ EXPLAINS: dict[tuple[str, str], tuple[str, ...]] = {
     ("one_sided", "warning"): ("leaves_seen_from_one_side", "shape_cut_off"),
     ("no_depth", "warning"): ("leaves_seen_from_one_side", "shape_cut_off", "one_sided"),
     ("same_position", "warning"): ("centres_shared",),
-    ("turned_masks", "error"): (*BY_MASKS, "low_fit", *DISAGREEMENT),
+    **{
+        (code, "error"): (*BY_MASKS, "masks_of_other_photo", "masks_of_other_photos", "low_fit", *DISAGREEMENT)
+        for code in ("turned_masks", "letterboxed_masks", "transposed_masks")
+    },
     **{(code, "error"): ("low_fit", *BY_FEATURES, *DISAGREEMENT) for code in BY_MASKS},
     **{(code, "error"): ("low_fit", *DISAGREEMENT) for code in OF_PHOTOS},
     ("no_leaf_left", "warning"): ("no_masks",),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +23,7 @@ from mvseg.formats.image_file import describe_turn
 from mvseg.formats.json_file import Int64, Items, check_content, load_json, read_json
 from mvseg.formats.masks.found_mask import check_categories
 from mvseg.formats.masks.other_json import refuse_other
-from mvseg.formats.run_lengths import Rle, decode_rle
+from mvseg.formats.run_lengths import Rle, decode_rle, shared_neighbours
 from mvseg.scene import Scene
 
 
@@ -43,6 +44,7 @@ class CocoAnnotation(BaseModel):
     category_id: Any = None
     segmentation: Any = None
     iscrowd: int = 0
+    segments_info: Any = None
 
 
 class CocoFile(BaseModel):
@@ -68,6 +70,9 @@ class _Results(RootModel[Items[CocoAnnotation]]):
 
 
 Crowd = Literal["mask", "ignore"]
+OUTSIDE, MANY_OUTSIDE = 0.02, 0.1  # chosen: share of the size outside of a photo, and of corners that lie there
+FAR = 10  # limit: sides of the photo; polygons that reach farther are refused
+FEW = 10  # chosen: min. polygons that tell that all were drawn on larger photos
 _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[FiniteFloat]] | Rle)
 
 
@@ -126,13 +131,18 @@ def read_coco(
         code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
         warn(Finding(code, str(path), {"count": num_crowds, "option": "--coco_crowd"}))
     if num_boxes:
+        if any(annotation.segments_info for annotation in coco.annotations):
+            mend = "the folder of its PNGs, in which each colour is a mask, or an instances JSON"
+            raise InputError(f"{path}: is COCO's panoptic JSON, expected {mend}")
         if not counts.total():
             raise InputError(f"{path}: {num_boxes} annotations have no mask (a box at most), and no others are there")
         warn(Finding("annotations_without_mask", str(path), {"count": num_boxes}))
-    with faults_of(path):
-        check_corners(annotation.segmentation for view in chosen for _, annotation in view)
-    check_categories(counts, categories, categories=names.values(), source=path)
     sizes = scene.cameras.sizes.tolist()
+    with faults_of(path):
+        check_segmentations(
+            (annotation.segmentation, size) for view, size in zip(chosen, sizes, strict=True) for _, annotation in view
+        )
+    check_categories(counts, categories, categories=names.values(), source=path)
     return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
 
 
@@ -279,6 +289,14 @@ def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarra
         InputError: another form, a number that is not finite, another size, run lengths that do not add up to the
             image, or polygons far larger than it. The message is a reason, without the annotation's id.
     """
+    if is_bitmap(segmentation, height):
+        try:
+            bitmap = np.array(segmentation, bool)
+        except ValueError:  # rows of different lengths
+            raise InputError("its bitmap has rows of different lengths") from None
+        if bitmap.shape != (height, width):
+            raise InputError(f"its bitmap is {bitmap.shape[1]} x {bitmap.shape[0]}, expected {width} x {height}")
+        return bitmap
     if isinstance(segmentation, list) and segmentation and not isinstance(segmentation[0], list):
         segmentation = [segmentation]
     try:
@@ -292,12 +310,51 @@ def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarra
     return decode_rle(checked.counts, width, height)
 
 
-def check_corners(segmentations: Iterable[Any]) -> None:
-    """Raises InputError: all corners of the polygons among these lie between 0 and 1, as shares of the size do."""
-    polygons = [each for each in segmentations if isinstance(each, list) and each]
-    outlines = (part for each in polygons for part in (each if isinstance(each[0], list) else [each]))
-    if polygons and all(isinstance(part, list) and all(map(_is_share, part)) for part in outlines):
+def is_bitmap(segmentation: Any, height: int) -> bool:
+    """Whether a mask is rows of its pixels: true and false, as Segment Anything's arrays become in JSON, or 0 and 1."""
+    if not isinstance(segmentation, list) or not segmentation or not isinstance(segmentation[0], list):
+        return False
+    first = segmentation[0]
+    if any(isinstance(each, bool) for each in first):
+        return True
+    is_whole = len(segmentation) == height > 1 and len({len(row) for row in segmentation}) == 1 and len(first) > 6
+    return is_whole and all(each in (0, 1) for row in segmentation for each in row)
+
+
+def check_segmentations(segmentations: Iterable[tuple[Any, Sequence[int]]]) -> None:
+    """Check all masks of a file, each with the width and height of its photo, for a form that would be misread.
+
+    Raises:
+        InputError: all corners of the polygons lie between 0 and 1, as shares of the size do; many lie outside of the
+            photos, as those of larger ones do; or run lengths go along the rows.
+    """
+    polygons, down, across = [], 0.0, 0.0
+    for segmentation, (width, height) in segmentations:
+        if isinstance(segmentation, list) and segmentation and not is_bitmap(segmentation, height):
+            outlines = segmentation if isinstance(segmentation[0], list) else [segmentation]
+            polygons += [(part, width, height) for part in outlines]
+        elif isinstance(segmentation, dict) and isinstance(segmentation.get("counts"), list) and width != height:
+            with suppress(TypeError, ValueError):  # of another form, which the decoder names
+                counts = np.array(segmentation["counts"], np.int64)
+                down, across = np.add((down, across), shared_neighbours(counts, width, height))
+    if polygons and all(isinstance(part, list) and all(map(_is_share, part)) for part, _, _ in polygons):
         raise InputError("all corners lie between 0 and 1: are they shares of the photo's size? expected pixels")
+    if across > 2 * down:
+        raise InputError("its run lengths go along the rows, expected down the columns: of mask.T, or by pycocotools")
+    corners = np.concatenate([np.zeros((0, 2)), *(_relative(*each) for each in polygons)])
+    corners = corners[(np.abs(corners) <= FAR).all(1)]  # the decoder refuses what lies farther away
+    is_out = (np.abs(corners - 0.5) > 0.5 + OUTSIDE).any(1)
+    if len(polygons) >= FEW and is_out.mean() > MANY_OUTSIDE:
+        x, y = corners[is_out].max(0)
+        what = f"corners lie up to {x:.1f} widths and {y:.1f} heights from the photo's corner"
+        raise InputError(f"{what}: were they drawn on larger photos?")
+
+
+def _relative(part: Any, width: int, height: int) -> np.ndarray:
+    """Corners (C, 2) of a polygon, in widths and heights of its photo; none of what is no polygon."""
+    is_polygon = isinstance(part, list) and len(part) % 2 == 0
+    is_polygon = is_polygon and all(isinstance(x, (int, float)) and abs(x) < 1 << 50 for x in part)
+    return np.array(part if is_polygon else [], float).reshape(-1, 2) / (width, height)
 
 
 def _is_share(number: Any) -> bool:
@@ -307,10 +364,13 @@ def _is_share(number: Any) -> bool:
 def _decode_polygons(polygons: list[list[float]], width: int, height: int) -> np.ndarray:
     """pycocotools walks along every edge in steps of a fifth of a pixel and keeps them all: distant corners, or many
     long edges, would need unbounded memory."""
-    if not polygons or any(len(polygon) < 6 or len(polygon) % 2 for polygon in polygons):
+    if not any(polygons) or any(len(polygon) % 2 for polygon in polygons):
         raise InputError("its segmentation is not of the expected polygons x1, y1, x2, y2, x3, y3 and so on")
+    polygons = [polygon for polygon in polygons if len(polygon) >= 6]
+    if not polygons:  # a point, or a line: no pixels
+        return np.zeros((height, width), bool)
     outlines = [np.array(polygon).reshape(-1, 2) for polygon in polygons]
-    if max(np.abs(corners).max() for corners in outlines) > 10 * max(width, height):
+    if max(np.abs(corners).max() for corners in outlines) > FAR * max(width, height):
         raise InputError("a polygon reaches far out of the image")
     length = sum(np.abs(corners - np.roll(corners, 1, axis=0)).max(1).sum() for corners in outlines)
     if length > width * height + 100 * (width + height):  # the outline of every second pixel is as long as this

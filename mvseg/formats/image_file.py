@@ -17,7 +17,7 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import IO
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -88,7 +88,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         data = path.read_bytes()
         if reader is PngImageFile and not _has_sound_chunks(data):
             raise InputError("it is cut short, or a checksum is wrong")
-        image = reader(BytesIO(data))
+        image = _open(reader, data)
         if size is not None and sorted(image.size) != sorted(size):  # a TIFF may be turned when it is decoded
             raise WrongSize(image.width, image.height)
         if image.width * image.height > MAX_PIXELS:
@@ -96,6 +96,16 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         turn = _orientation_of(image) if _is_turned_by_decoder(image) else 1
         _load(image)
         return _turn_back(image, turn) if turn > 1 else image
+
+
+def _open(reader: Any, data: bytes) -> ImageFile:
+    try:
+        return reader(BytesIO(data))
+    except SyntaxError as error:
+        if reader is TiffImageFile and "pixel mode" in str(error):
+            what = "it is a TIFF of numbers of 64 bits, or of half ones"
+            raise InputError(f"{what}, expected 8, 16 or 32 bits: labels.astype('uint16')") from None
+        raise
 
 
 def _is_turned_by_decoder(image: ImageFile) -> bool:

@@ -83,9 +83,30 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
         part = np.asarray(image.crop((0, top, image.width, bottom)))
         if part.any():  # pages of zeros that are never written take no memory
             labels[top:bottom] = part
-    if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any():
+    has_numbers = bool(((labels > 0) & (labels < VOC_BORDER)).any())
+    if image.mode == "P" and has_numbers and not _clear_background(labels, path):
         labels[labels == VOC_BORDER] = IGNORE_LABEL
     return labels
+
+
+def _clear_background(labels: np.ndarray, where: object = "") -> bool:
+    """Whether 255 is around all masks of a label map (H, W) uint16, and no mask's number: it becomes 0 in place.
+
+    Raises:
+        InputError: then 0 is a mask's number, and would be lost.
+    """
+    sides = np.concatenate((labels[0], labels[-1], labels[1:-1, 0], labels[1:-1, -1]))
+    background = labels == VOC_BORDER
+    if 2 * np.count_nonzero(sides == VOC_BORDER) <= len(sides):
+        return False
+    num_zeros = np.count_nonzero(labels == 0)
+    if 0 < num_zeros < np.count_nonzero(background):
+        mend = "is 255 the background, and 0 a leaf? add 1, so that it becomes 0 in 8 bits"
+        raise InputError(f"{where}: 255 is around all masks, and 0 among them: {mend}" if where else mend)
+    if num_zeros:
+        return False
+    labels[background] = 0
+    return True
 
 
 def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
@@ -109,13 +130,23 @@ def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
         return _number_colours(path, image, read_deep(path, image))
     if image.mode in ("I", "F"):
         return labels_of_numbers(path, np.asarray(image))
+    if image.mode == "P" and _is_reordered(image):
+        return _number_colours(path, image.convert("RGB"), None)
     return labels_of(image, path)
+
+
+def _is_reordered(image: Image.Image) -> bool:
+    """Whether a program has ordered the palette anew, so that the index of black, which is nothing, is not 0."""
+    palette = np.array(image.getpalette() or [0, 0, 0]).reshape(-1, 3)
+    used = [index for _, index in image.getcolors(1 << 16) or [] if isinstance(index, int) and index < len(palette)]
+    is_black = [index for index in used if index and not palette[index].any()]
+    return bool(is_black) and bool(palette[0].any()) and len(used) > 2
 
 
 def ignore_border(labels: np.ndarray) -> bool:
     """Whether 255 is VOC's border in a label map (H, W) uint16, which then becomes 65535 in place: more of the other
     masks' pixels touch it than touch nothing. In palette PNGs it is ignored in any case."""
-    if labels.max(initial=0) != VOC_BORDER:
+    if labels.max(initial=0) != VOC_BORDER or _clear_background(labels):
         return False
     border = labels == VOC_BORDER
     is_other = (labels > 0) & ~border

@@ -88,6 +88,12 @@ def read_calibration(folder: Path, file: str) -> Calibration:
     entries = read_yaml(path, EXPECTED, loader=_Loader)
     if not isinstance(entries, dict):
         raise InputError(f"{path}: is not a calibration, expected {EXPECTED}")
+    of_kalibr = [str(key) for key, each in entries.items() if isinstance(each, dict) and "distortion_coeffs" in each]
+    if of_kalibr:
+        mend = "camera_matrix of its intrinsics (fu, fv, pu, pv), distortion_coefficients of its distortion_coeffs"
+        mend += ", distortion_model plumb_bob (its radtan) or equidistant, image_width and image_height"
+        what = f"is Kalibr's, of {', '.join(of_kalibr)}"
+        raise InputError(f"{path}: {what}; expected one camera a file, in OpenCV's form: {mend}")
     entries = {str(key).lower().replace("_", ""): value for key, value in entries.items()}
     calibration = {name: entries[key] for name, keys in NAMES.items() for key in reversed(keys) if key in entries}
     if isinstance(entries.get("imagesize"), list) and len(entries["imagesize"]) == 2:
@@ -103,6 +109,11 @@ def read_calibration(folder: Path, file: str) -> Calibration:
     model = str(entries.get("distortionmodel") or "plumb_bob")
     is_fisheye = model in FISHEYES or bool(entries.get("fisheyemodel"))
     distortion = content.distortion[:8]
+    if np.any(entries.get("xi") or 0):
+        raise InputError(f"{path}: is of an omnidirectional lens (xi), which is not supported")
+    if len(content.distortion) == 4 and any(distortion) and not {"distortionmodel", "fisheyemodel"} & entries.keys():
+        mend = "k1, k2, p1, p2 (distortion_model: plumb_bob), or k1 to k4 of a fisheye (distortion_model: equidistant)?"
+        raise InputError(f"{path}: has 4 distortion coefficients without a model: {mend}")
     if model not in ("plumb_bob", "rational_polynomial", *FISHEYES):
         raise InputError(f"{path}: the distortion model '{model}' is not known, expected plumb_bob or equidistant")
     if any(content.distortion[8:]):

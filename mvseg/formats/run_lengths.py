@@ -57,6 +57,22 @@ def decode_crop(counts: str | list[int], width: int, height: int) -> tuple[tuple
     return (left, top, right, bottom), strip.reshape(right - left, height)[:, top:bottom].T
 
 
+def shared_neighbours(runs: NDArray[np.int64], width: int, height: int) -> tuple[float, float]:
+    """How many pixels of a mask have its next pixel beside them in the next column, by runs down the columns, and by
+    runs along the rows. Of a mask that hangs together, the right one is nearly all."""
+    ends = runs.cumsum()
+    stops = ends[1::2]
+    starts = ends[::2][: len(stops)]
+    places = np.append(0, np.stack([starts, stops], 1).ravel())
+    counts = np.append(0, np.stack([0 * starts, stops - starts], 1).ravel().cumsum())
+
+    def shared(step: int) -> float:
+        inside = np.interp(stops + step, places, counts) - np.interp(starts + step, places, counts)
+        return float(inside.sum())
+
+    return shared(height), shared(width)
+
+
 def _read_runs(counts: str | list[int], width: int, height: int) -> NDArray[np.int64]:
     runs = _decompress(counts) if isinstance(counts, str) else counts
     if min(runs, default=0) < 0 or sum(runs) != width * height:

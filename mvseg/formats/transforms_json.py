@@ -6,7 +6,6 @@ turned and scaled it (COLMAP's). Its `mask_path` marks what to train on and does
 
 from __future__ import annotations
 
-import itertools
 import math
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,12 +19,22 @@ from mvseg.findings.finding import Finding
 from mvseg.formats.json_file import Items, Pixels, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
+from mvseg.formats.rig import MANY
 from mvseg.scene import ROTATION_TOLERANCE, Scene
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 Row4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 Rows = tuple[Row4, Row4, Row4] | tuple[Row4, Row4, Row4, Row4]
 OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "is_latlong", "is_equirectangular")  # of instant-ngp
+# Keys that move pixels or cameras, and are not read: they must be 0.
+MOVING = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "skew", "rolling_shutter", "x_fov", "y_fov")
+# Keys that say nothing about cameras.
+ASIDE = {
+    "aabb_scale", "scale", "offset", "up", "from_na", "sharpness", "rotation", "colmap_im_id", "depth_file_path",
+    "ply_file_path", "orientation_override", "train_filenames", "val_filenames", "test_filenames", "time", "fps",
+    "n_frames", "integer_depth_scale", "white_transparent", "black_transparent", *MOVING, *OTHER_LENSES,
+}  # fmt: skip
+LENS = ("k1", "k2", "k3", "k4", "p1", "p2")  # order of nerfstudio's distortion_params
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
 
 
@@ -47,11 +56,24 @@ class _Intrinsics(BaseModel):
     k4: FiniteFloat | None = None
     p1: FiniteFloat | None = None
     p2: FiniteFloat | None = None
+    distortion_params: Items[FiniteFloat] | None = None
 
     @property
     def intrinsics(self) -> dict[str, Any]:
-        """Intrinsics that the file states."""
-        return self.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
+        """Intrinsics that the file states.
+
+        Raises:
+            InputError: nerfstudio's list of coefficients has another length, or other ones are stated beside it.
+        """
+        stated = self.model_dump(include={*_Intrinsics.model_fields} - {"distortion_params"}, exclude_none=True)
+        if self.distortion_params is None:
+            return stated
+        if len(self.distortion_params) != len(LENS):
+            raise InputError(f"distortion_params are {len(self.distortion_params)} numbers, expected {', '.join(LENS)}")
+        listed = dict(zip(LENS, self.distortion_params, strict=True))
+        if others := [key for key in LENS if stated.get(key, listed[key]) != listed[key]]:
+            raise InputError(f"{others[0]} is {stated[others[0]]:g}, and {listed[others[0]]:g} in distortion_params")
+        return stated | listed
 
 
 class _Frame(_Intrinsics):
@@ -78,19 +100,42 @@ def read_transforms(path: Path) -> Scene:
             transform is not a similarity, or a camera is unsound; see `build_scene`.
     """
     transforms = read_json(path, _Transforms)
-    shared = transforms.intrinsics
+    with faults_of(path):
+        shared = transforms.intrinsics
     undo = _undo_applied(path, transforms)
-    for entry, key in itertools.product((transforms, *transforms.frames), OTHER_LENSES):
-        if (entry.model_extra or {}).get(key):
-            raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
+    _check_keys(path, transforms)
     photos = []
     for index, frame in enumerate(transforms.frames):
         with faults_of(f"{path}: frame {index} ({frame.file_path})"):
-            photos.append(_photo(path.parent, frame, shared | frame.intrinsics, undo=undo))
+            photos.append(_photo(path.parent, frame, _merge(shared, frame.intrinsics), undo=undo))
     num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
     if num_masks:
         warn(Finding("mask_paths_not_used", str(path), {"count": num_masks}))
     return build_scene(path.parent, photos, unit="", source=path)
+
+
+def _check_keys(path: Path, transforms: _Transforms) -> None:
+    """Refuse keys that change what the others mean; warn of those that nobody knows, once each."""
+    unknown: dict[str, str] = {}
+    for owner, entry in (("the file", transforms), *((each.file_path, each) for each in transforms.frames)):
+        extra = entry.model_extra or {}
+        for key in OTHER_LENSES:
+            if extra.get(key):
+                raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
+        for key in MOVING:
+            if np.any(extra.get(key) or 0):
+                raise InputError(f"{path}: '{key}' of {owner} is {extra[key]}, which is not supported, expected 0")
+        for key in extra.keys() - ASIDE:
+            unknown.setdefault(key, owner)
+    for key, owner in sorted(unknown.items())[:MANY]:
+        warn(Finding("unknown_key", str(path), {"key": key, "owner": owner}))
+
+
+def _merge(shared: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Intrinsics of a frame: its own override those of the file, its angle of view the file's focal length."""
+    angles, lengths = {"camera_angle_x", "camera_angle_y"}, {"fl_x", "fl_y"}
+    replaced = angles | lengths if own.keys() & angles and not own.keys() & lengths else set()
+    return {key: value for key, value in shared.items() if key not in replaced} | own
 
 
 def _undo_applied(path: Path, transforms: _Transforms) -> tuple[np.ndarray, float]:
@@ -124,9 +169,11 @@ def _complete(folder: Path, frame: _Frame, given: dict[str, Any]) -> dict[str, A
     values = dict(given)
     if "w" not in values or "h" not in values:
         values = dict(zip(("w", "h"), size_of_photo(folder, frame.file_path), strict=True)) | given
-    if "fl_x" not in values and "camera_angle_x" in values:
-        fx = values["w"] / 2 / math.tan(values["camera_angle_x"] / 2)
-        fy = values["h"] / 2 / math.tan(values["camera_angle_y"] / 2) if "camera_angle_y" in values else fx
+    if "fl_x" not in values and values.keys() & {"camera_angle_x", "camera_angle_y"}:
+        sides = {"x": values["w"], "y": values["h"]}
+        of_angle = {axis: side / 2 / math.tan(values[f"camera_angle_{axis}"] / 2) for axis, side in sides.items()
+                    if f"camera_angle_{axis}" in values}  # fmt: skip
+        fx, fy = of_angle.get("x", of_angle.get("y")), of_angle.get("y", of_angle.get("x"))
         values = {"fl_y": fy, "cx": values["w"] / 2, "cy": values["h"] / 2} | values | {"fl_x": fx}
     for key in ("fl_x", "cx", "cy"):
         if key not in values:
@@ -141,6 +188,9 @@ def _lens(intrinsics: dict, K: np.ndarray) -> pycolmap.Camera | None:
         return opencv_lens(K, [k1, k2, k3, k4], width=width, height=height, is_fisheye=True)
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         raise InputError(f"the camera model '{model}' is not known, expected OPENCV, OPENCV_FISHEYE or PINHOLE")
+    if "camera_model" not in intrinsics and "is_fisheye" not in intrinsics and (k3 or k4) and not (p1 or p2):
+        raise InputError("k3 or k4 without a camera_model: of a fisheye (OPENCV_FISHEYE), or of a plain lens (OPENCV)?")
     if k4:
-        raise InputError(f"k4 is {k4:g} in the model {model}, expected 0 (a term in r^8 is not supported)")
+        mend = "a term in r^8 is not supported; of a fisheye, the camera_model is OPENCV_FISHEYE"
+        raise InputError(f"k4 is {k4:g} in the model {model}, expected 0 ({mend})")
     return opencv_lens(K, [k1, k2, p1, p2, k3], width=width, height=height)

@@ -24,8 +24,8 @@ from mvseg.findings.finding import Finding
 from mvseg.formats.coco import (
     CocoAnnotation,
     Crowd,
-    check_corners,
     check_images_once,
+    check_segmentations,
     decode_segmentation,
     read_files,
 )
@@ -154,8 +154,9 @@ def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Cro
     unlisted = sorted(annotations_of.keys() - {str(image.id) for image in content.images})
     if unlisted:
         raise InputError(f"{labels} has annotations of image {unlisted[0]}, which it does not list")
+    size_of = {str(image.id): (image.width or 1 << 30, image.height or 1 << 30) for image in content.images}
     with faults_of(labels):
-        check_corners(annotation.segmentation for annotation in content.annotations)
+        check_segmentations((each.segmentation, size_of[str(each.image_id)]) for each in content.annotations)
     num_crowds = sum(bool(annotation.iscrowd) for annotation in content.annotations)
     if num_crowds:
         code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
@@ -199,7 +200,7 @@ def _read(sample: Sample) -> tuple[LabelledPhoto, int]:
         except InputError as error:
             raise InputError(f"the photo cannot be read, expected a whole image file: {error}") from None
         if not sample.kind:
-            return _read_annotations(sample, photo), 0
+            return _read_annotations(sample, photo)
         try:
             content = read_photo_masks(sample.files, sample.kind, photo.shape[1::-1])
         except InputError as error:  # here, the size that masks must have is that of the photo
@@ -207,25 +208,26 @@ def _read(sample: Sample) -> tuple[LabelledPhoto, int]:
         if isinstance(content, np.ndarray):
             ignore_border(content)
             return label_photo(photo, content), 0
-        masks = [each.mask for each in content if each.mask is not None]
-        if not all(mask.any() for mask in masks):
-            raise InputError("one of its masks covers no pixel")
+        masks = [each.mask for each in content if each.mask is not None and each.mask.any()]
         nothing = np.zeros(photo.shape[:2], bool)
         return mask_photo(photo, masks, classes=[1] * len(masks), ignore=nothing), len(content) - len(masks)
 
 
-def _read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
-    """A photo with its COCO annotations; crowds become ignored pixels, but for those of other annotations."""
+def _read_annotations(sample: Sample, photo: np.ndarray) -> tuple[LabelledPhoto, int]:
+    """A photo with its COCO annotations, and how many have no pixel; crowds become ignored pixels, but for those of
+    other annotations."""
     height, width = photo.shape[:2]
     if sample.size is not None and sample.size != (width, height):
         stated = f"{sample.size[0]} x {sample.size[1]}"
         raise InputError(f"the photo is {width} x {height} pixels, its COCO entry says {stated}")
     masks, classes, ignore = [], [], np.zeros((height, width), bool)
+    num_empty = 0
     for annotation in sample.annotations:
         with faults_of(f"annotation {annotation.id}"):
             mask = decode_segmentation(annotation.segmentation, width, height)
             if not mask.any():
-                raise InputError("its mask covers no pixel")
+                num_empty += 1
+                continue
             category = str(annotation.category_id)
             if annotation.iscrowd:
                 ignore |= mask
@@ -236,7 +238,7 @@ def _read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
                 raise InputError(f"its category {category} is not listed")
     for mask in masks:
         ignore &= ~mask  # a labelled instance is known, whatever covers part of it
-    return mask_photo(photo, masks, classes=classes, ignore=ignore)
+    return mask_photo(photo, masks, classes=classes, ignore=ignore), num_empty
 
 
 def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]:

@@ -113,8 +113,7 @@ def test_a_polygon_without_a_list_around_it(scene: Scene, tmp_path: Path) -> Non
     np.testing.assert_array_equal(read_one(tmp_path, scene, POLYGON), expected)
     path = write(tmp_path, [{"segmentation": POLYGON, "image_id": "10"}])
     np.testing.assert_array_equal(read_all(path, scene)[0][0][1], expected)
-    with pytest.raises(InputError, match=r"annotation 1: its segmentation is not of the expected polygons"):
-        read_one(tmp_path, scene, POLYGON[:4])
+    assert not read_one(tmp_path, scene, POLYGON[:4]).any()  # a line
 
 
 VIA_REGION = {"shape_attributes": {"name": "polygon", "all_points_x": [1, 5, 3], "all_points_y": [1, 2, 4]}}
@@ -209,8 +208,6 @@ BAD: list[tuple[Any, str]] = [
     ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, expected 60 x 40"),
     ({"size": [10**9, 10**9], "counts": "PPYo1"}, "its mask is 1000000000 x 1000000000"),
     ([[], []], "expected polygons"),
-    ([[1.0, 2.0, 3.0, 4.0]], "expected polygons"),
-    ([POLYGON, [1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([[*POLYGON, 3.0]], "expected polygons"),
     ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "reaches far out of the image"),
     ([[-500.0, 0.0, 560.0, 40.0] * 3000], "polygons are 6[0-9]* pixels long, more than any outline in the image"),

@@ -40,6 +40,8 @@ def test_opencvs_files_agree_with_its_projection(number: int, head: str, tmp_pat
     distortion = np.zeros((1, number))
     distortion[0, : min(number, 8)] = np.resize(DISTORTION, min(number, 8))
     entries = {"distortion_coefficients": distortion} if number else {}
+    if number == 4:  # of a fisheye, otherwise
+        entries["distortion_model"] = "plumb_bob"
     write_opencv(tmp_path / "a.yaml", image_width=1280, image_height=720, camera_matrix=MATRIX, **entries)
     _, _, rest = (tmp_path / "a.yaml").read_text().partition("\n")
     assert "!!opencv-matrix" in rest

@@ -94,8 +94,7 @@ def test_wide_form(tmp_path: Path) -> None:
     begin = ["plant", "leaf", "use", "doubts", "area", "area_sd", "length", "length_sd", "width", "width_sd"]
     assert [*first][:12] == [*begin, "length_width_ratio", "length_width_ratio_sd"]
     assert [*first][-6:] == ["sure_views", "iou", "unit", "method", "quality", "probability"]
-    first, second = traits_of().leaves
-    leaves = first, replace(second, probability=0.75)
+    leaves = traits_of().leaves[0], replace(traits_of().leaves[1], probability=0.75)
     write_wide(tmp_path / "chosen.csv", traits_of(leaves=leaves))
     assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
     assert (first["leaf"], first["use"], first["doubts"], first["quality"]) == ("1", "yes", "", "good")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,8 @@ import numpy as np
 
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
+
+MANY_PARTS = 4  # chosen: shapes of one leaf from which they are suspicious
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +22,21 @@ class FoundMask:
         label: its number in the file.
         mask: (H, W) bool, in the frame of the photo; None for a box, a line or a point, which show no pixels.
         category: what it shows ("leaf"); "" where the format has no categories.
+        num_parts: shapes that it is made of.
     """
 
     label: int
     mask: np.ndarray | None
     category: str = ""
+    num_parts: int = 1
+
+
+def check_parts(masks: Iterable[FoundMask], source: object) -> None:
+    """Raises InputError: most shapes are in masks of many parts: the group that they share is no leaf."""
+    counts = [each.num_parts for each in masks]
+    if 2 * sum(count for count in counts if count >= MANY_PARTS) > sum(counts):
+        what = f"{sum(counts)} shapes are parts of {len(counts)} leaves by their group_id"
+        raise InputError(f"{source}: {what}: is it the number of the plant? clear it, or give each leaf its own")
 
 
 def check_categories(

@@ -8,6 +8,7 @@ Shapes of one label and one `group_id` are parts of one leaf. labelme's own scri
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from PIL.PngImagePlugin import PngImageFile
 from pydantic import BaseModel, FiniteFloat
 
 from mvseg.errors import InputError, faults_of
-from mvseg.formats.coco import check_corners, decode_segmentation
+from mvseg.formats.coco import check_segmentations, decode_segmentation
 from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
 
@@ -55,15 +56,20 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
         raise InputError(f"{path}: its photo is {size[0]} x {size[1]}, its camera says {width} x {height}")
     polygons = [shape.points for shape in content.shapes if shape.shape_type in (None, "polygon")]
     with faults_of(path):
-        check_corners([number for corner in points for number in corner] for points in polygons)
+        check_segmentations(([x for corner in points for x in corner], (width, height)) for points in polygons)
     parts: dict[tuple[str, Any], np.ndarray | None] = {}
+    counts: Counter[tuple[str, Any]] = Counter()
     for index, shape in enumerate(content.shapes):
         with faults_of(f"{path}: shapes[{index}] ({shape.label})"):
             mask = _draw(shape, width, height)
         key = (shape.label, ("alone", index) if shape.group_id is None else shape.group_id)
+        counts[key] += 1
         earlier = parts.get(key)
         parts[key] = mask if earlier is None else earlier if mask is None else earlier | mask
-    return [FoundMask(number, mask, label) for number, ((label, _), mask) in enumerate(parts.items(), start=1)]
+    return [
+        FoundMask(number, mask, key[0], num_parts=counts[key])
+        for number, (key, mask) in enumerate(parts.items(), start=1)
+    ]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # absurd corners become infinite, which the codec refuses

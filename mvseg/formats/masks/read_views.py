@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError, warn
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import describe_turn
 from mvseg.formats.label_png import ignore_border, read_label_image, read_mask_images
-from mvseg.formats.masks.found_mask import FoundMask, check_categories
+from mvseg.formats.masks.found_mask import FoundMask, check_categories, check_parts
 from mvseg.formats.masks.labelme import read_labelme
 from mvseg.formats.masks.npy_masks import read_npy
 from mvseg.formats.masks.recognise import MaskFiles
@@ -34,6 +35,7 @@ def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> It
     """
     counts: Counter[str] = Counter()
     num_boxes = num_borders = 0
+    entries: list[FoundMask] = []
     if files.kind == YOLO_TRACKS:
         warn(Finding("confidence_and_track", str(files.source)))
     for view in range(len(files.files)):
@@ -43,13 +45,16 @@ def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> It
             turn = describe_turn(scene.views[view].path)
             raise InputError(f"{error} (view {view}{turn})") from None
         if isinstance(content, np.ndarray):
-            num_borders += ignore_border(content)
+            with faults_of(f"{files.files[view][0]} (view {view})"):
+                num_borders += ignore_border(content)
             yield content
             continue
+        entries += [replace(each, mask=None) for each in content]
         counts.update(each.category for each in content if each.mask is not None)
         num_boxes += sum(each.mask is None for each in content)
         taken = [each for each in content if not wanted or each.category in wanted]
         yield [(each.label, each.mask) for each in taken if each.mask is not None]
+    check_parts(entries, files.source)
     if num_borders:
         warn(Finding("border_ignored", str(files.source), {"count": num_borders}))
     if num_boxes:

@@ -66,6 +66,8 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     """
     if masks.is_file() and masks.suffix.lower() == ".json":
         return MaskFiles(masks, "COCO", ((masks,),) * len(scene.views))
+    if masks.is_file() and masks.suffix.lower() == ".xml":
+        _refuse_cvat(masks)
     if not masks.is_dir():
         what = "not a known kind of masks" if masks.is_file() else "no such masks"
         raise InputError(f"{masks}: {what}, {EXPECTED}")
@@ -91,6 +93,12 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     find_views([f"{name}.png" for name in groups[kind]], scene, source=folder, warn_of_loose=True)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
+
+
+def _refuse_cvat(path: Path) -> None:
+    with path.open("rb") as file:
+        if b"<annotations" in file.read(1 << 12):
+            raise InputError(f"{path}: is CVAT's XML, expected its export 'COCO 1.0' or 'Segmentation mask 1.1'")
 
 
 def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
@@ -197,6 +205,9 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
     if unclear:
         raise InputError(f"{masks}: {unclear[0]}")
+    for path in paths:
+        if path.suffix.lower() == ".xml":
+            _refuse_cvat(path)
     listed = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
     if jsons:
         message = f"holds {len(jsons)} JSON files ({listed}), none of them named after a photo"

@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from mvseg.errors import InputError, faults_of
-from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.coco import check_segmentations, decode_segmentation
 from mvseg.formats.json_file import load_json
 from mvseg.formats.masks.found_mask import FoundMask
 
@@ -22,6 +22,8 @@ def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         expected = "expected labelme's (shapes) or Segment Anything's (annotations, or a list of masks)"
         raise InputError(f"{path}: is JSON of another form, {expected}")
+    with faults_of(path):
+        check_segmentations((entry.get("segmentation"), (width, height)) for entry in entries)
     masks = []
     for number, entry in enumerate(entries, start=1):
         segmentation = entry.get("segmentation")
