@@ -69,7 +69,9 @@ def test_a_person_mends_links(page: tuple[sync_api.Page, Path]) -> None:
     settle(shown)
     assert pairs(shown) == behind
     assert saved(folder) == ["same_track"]
-    assert shown.locator("#said li").all_inner_texts()[0].startswith("leaf 1 of day 0 = leaf 1 of day 1")
+    listed = shown.locator("#said li").all_inner_texts()[0]
+    assert listed.startswith("leaf 1 of day 0 = leaf 1 of day 1")
+    assert shown.locator("#note").inner_text().startswith("leaf 1 of day 0 = leaf 1 of day 1.")  # the same numbers
     # undo
     shown.keyboard.press("u")
     settle(shown)

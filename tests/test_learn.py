@@ -29,7 +29,7 @@ from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
-from mvseg.training.view_labels import ViewLabels
+from mvseg.training.view_labels import ViewLabels, label_views
 from warned import warns_of
 
 SIZE = 96
@@ -192,3 +192,13 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
     said = json.loads((tmp_path / "out" / "run.json").read_text())["learned"]
     assert said["rounds"] == 1
     assert len(said["agreed_area"]) == 2
+
+
+def test_weights_that_were_learned_depend_on_the_photos(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant = see(leafy, monkeypatch)
+    chances = plant.instances.probabilities
+    labels = label_views(plant.masks, plant.proposals, plant.opened.photos, probabilities=chances)
+    first, photos = module._describe(plant, labels), plant.opened.photos
+    assert module._describe(plant, labels) == first
+    monkeypatch.setattr(type(photos), "sha256", lambda _, view: f"{view} of another day")
+    assert module._describe(plant, labels) != first

@@ -27,7 +27,7 @@ SHOWN = 4  # limit: names of running scenes beside the progress bar
 
 @dataclass(frozen=True)
 class BatchCounts:
-    """Numbers of scenes by outcome: `kept` are done scenes of an earlier run; `warned` are done scenes with
+    """Numbers of scenes by outcome: `resumed` are done scenes of an earlier run; `warned` are done scenes with
     warnings."""
 
     done: int

@@ -16,6 +16,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import safetensors.torch
 from torch import Tensor
@@ -46,11 +47,7 @@ class CachedDetections:
 
         `made_by`: the detector and its options, in words that differ when any of them does.
         """
-        scene = photos.scene
-        lens, K = scene.views[view].lens, scene.cameras.K[view].tolist()
-        size = scene.cameras.sizes[view].tolist()
-        camera = [None if lens is None else [lens.model_name, list(lens.params)], K, size]
-        text = json.dumps([photos.sha256(view), photo_bits(scene, view), camera, made_by, box])
+        text = json.dumps([*describe_photo(photos, view), made_by, box])
         return self._use(f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors")
 
     def learned(self, made_from: str) -> Path:
@@ -64,6 +61,14 @@ class CachedDetections:
     def _use(self, name: str) -> Path:
         self.used.add(name)
         return self.folder / name
+
+
+def describe_photo(photos: Photos, view: int) -> list[Any]:
+    """All that the undistorted photo of a view depends on."""
+    scene = photos.scene
+    lens, K = scene.views[view].lens, scene.cameras.K[view].tolist()
+    camera = [None if lens is None else [lens.model_name, list(lens.params)], K, scene.cameras.sizes[view].tolist()]
+    return [photos.sha256(view), photo_bits(scene, view), camera]
 
 
 def write_detections(path: Path, detections: dict[str, Tensor]) -> None:

@@ -351,7 +351,7 @@ def check_segmentations(segmentations: Iterable[tuple[Any, Sequence[int]]]) -> N
 
 
 def _relative(part: Any, width: int, height: int) -> np.ndarray:
-    """Corners (C, 2) of a polygon, in widths and heights of its photo; none of what is no polygon."""
+    """Corners (C, 2) of a polygon, in widths and heights of its photo; none where it is no polygon."""
     is_polygon = isinstance(part, list) and len(part) % 2 == 0
     is_polygon = is_polygon and all(isinstance(x, (int, float)) and abs(x) < 1 << 50 for x in part)
     return np.array(part if is_polygon else [], float).reshape(-1, 2) / (width, height)

@@ -18,7 +18,7 @@ import torch
 
 from mvseg._version import code_hash
 from mvseg.corrections.file import Corrections
-from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detection.cached_detections import CachedDetections, describe_photo
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
@@ -165,6 +165,7 @@ def _describe(plant: Plant, labels: ViewLabels) -> str:
         {
             "weights": hash_files(Path(weights_path(plant.opened.config.detect.weights))),
             "labels": digest.hexdigest(),
+            "photos": [describe_photo(plant.opened.photos, view) for view in range(len(plant.scene.views))],
             "size": plant.image_size,
             "steps": STEPS,
             "code": code_hash(),

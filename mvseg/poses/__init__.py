@@ -1,1 +1,1 @@
-"""From photos alone to cameras with a scale and axes: structure from motion, turntables, and poses refined by masks."""
+"""From photos alone to cameras with a scale and axes: structure from motion, frames of films, turntables, lenses."""

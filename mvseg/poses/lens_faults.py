@@ -24,7 +24,7 @@ Lens = Callable[[pycolmap.Camera], tuple[str, list[float]]]  # the model and its
 
 @dataclass(frozen=True, eq=False)
 class LensReport:
-    """What other lenses say of photos.
+    """Whether another lens explains the photos better.
 
     Attributes:
         finding: the fault; None: the lens explains the photos, or nothing explains them better.
@@ -73,8 +73,8 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
     is_squashed = abs(math.log(aspect)) > LENS.squashed and is_square_known and two.noise < LENS.noise_of_squashed
     least_of_own = min(LENS.noise_of_cut_each, LENS.gain_of_own * others)  # it has by far the most freedom
     likely = [
-        (each.noise, finding, kept)
-        for each, finding, kept, is_so in (
+        (each.noise, finding, lens)
+        for each, finding, lens, is_so in (
             (two, Finding("squashed", values={"aspect": aspect}), two.model, is_squashed),
             (middle, Finding("photos_cut"), model, middle.noise < LENS.noise_of_cut),
             (own_middle, Finding("photos_cut_each"), model, own_middle.noise < least_of_own),
@@ -84,8 +84,8 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
     ]
     if not likely:
         return LensReport(None, model, is_square_known)
-    _, finding, kept = min(likely, key=lambda each: each[0])
-    return LensReport(finding, kept, is_square_known)
+    _, finding, best = min(likely, key=lambda each: each[0])
+    return LensReport(finding, best, is_square_known)
 
 
 def _same(camera: pycolmap.Camera) -> tuple[str, list[float]]:

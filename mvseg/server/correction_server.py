@@ -158,7 +158,7 @@ class Corrector(Generic[Kind]):
         opened: the folder.
         edits: its edits.
         task: of the thread.
-        shown: on the page.
+        page_state: on the page.
         making: how far the whole result is, which another thread makes; None: it is not made.
         number: of all news.
     """

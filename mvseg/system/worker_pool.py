@@ -47,17 +47,21 @@ def start_pool(num_workers: int) -> Iterator[ProcessPoolExecutor]:
 
     A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
     """
-    context = multiprocessing.get_context("spawn")
-    theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
     before = os.environ.get(SAFE_PATH)
-    os.environ[SAFE_PATH] = "1"  # no worker imports a module of the user's folder
+    os.environ[SAFE_PATH] = "1"  # no process of it imports a module of the user's folder
     try:
-        yield pool
+        context = multiprocessing.get_context("spawn")
+        theirs, ours = context.Pipe(duplex=False)
+        pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
+        try:
+            yield pool
+        finally:
+            ours.close()  # an orderly shutdown of the interpreter would take seconds
+            pool.shutdown(cancel_futures=True)
     finally:
-        os.environ.pop(SAFE_PATH) if before is None else os.environ.update({SAFE_PATH: before})
-        ours.close()  # an orderly shutdown of the interpreter would take seconds
-        pool.shutdown(cancel_futures=True)
+        del os.environ[SAFE_PATH]
+        if before is not None:
+            os.environ[SAFE_PATH] = before
 
 
 def default_workers() -> int:

@@ -104,11 +104,11 @@ def find_stems(
     if not photos.exist:
         return _of_bases(axes, frame)
     plant = see_plant(surfaces, masks, cameras, photos=photos)
-    shown = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
-    carried = sum(int(axis.is_near.sum()) for axis in shown) / len(surfaces)
-    if shown and carried >= AXES.near_share:  # else what is left of several axes may stand in free air
+    supported = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
+    carried = sum(int(axis.is_near.sum()) for axis in supported) / len(surfaces)
+    if supported and carried >= AXES.near_share:  # else what is left of several axes may stand in free air
         tells_up = len(axes) == 1 and carried >= UP_LEAVES and plant.share_seen(axes[0].tube.points()) >= UP_SEEN
-        return _of_bases(shown, frame, tells_up=tells_up)
+        return _of_bases(supported, frame, tells_up=tells_up)
     path = find_path(plant.cells, plant.leaves)
     if path is None or plant.support(path.points) < SUPPORTED:
         return ()

@@ -47,7 +47,7 @@ def check_ids(
 
     Args:
         masks: D masks. A merged mask that moves loses that mark, unless two surfaces are found in it again. Masks that
-            the user corrected or linked keep their ids.
+            the user corrected or linked keep an id that they have; a corrected one without any may get one.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         config: that the masks were matched with.
 

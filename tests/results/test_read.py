@@ -35,6 +35,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.regions import mask_box
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
+from mvseg.results.run_record import load_run
 from mvseg.results.shapes_file import write_surfaces
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
@@ -283,6 +284,11 @@ def test_what_run_json_says_is_checked(saved: Path, key: str, value: object, mes
     change_run(saved, **{key: value})
     with pytest.raises(InputError, match=message):
         load_result(saved)
+
+
+def test_ids_of_a_stranger_in_run_json_are_no_numbers_without_an_end(saved: Path) -> None:
+    change_run(saved, traits={"unit": "mm", "up": None, "rejected": {"9" * 5000: "stem", "x": "stem", "2": "stem"}})
+    assert load_run(saved).traits.kinds == {2: "stem"}
 
 
 @pytest.mark.parametrize(

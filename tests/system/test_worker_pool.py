@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing import active_children
+from pathlib import Path
 
 import pytest
 import torch
@@ -49,6 +52,20 @@ def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor)
     with pytest.raises(InputError, match=r"^13 brings bad luck$"):
         list(map_in_order(square, [1, 13, 2], workers))
     assert next(map_in_order(square, [3], workers))[0] == 9  # the workers are still there
+
+
+@pytest.mark.slow
+def test_workers_import_nothing_of_the_users_folder(tmp_path: Path) -> None:
+    (tmp_path / "pickle.py").write_text("raise SystemExit('the module of a stranger')")
+    script = tmp_path / "script" / "run.py"
+    script.parent.mkdir()
+    script.write_text(
+        "import sys\nfrom mvseg.system.worker_pool import run_all\n"
+        "if __name__ == '__main__':\n    sys.exit(list(run_all(abs, [-1, -2, 3], 2)) != [1, 2, 3])\n"
+    )
+    command = [sys.executable, str(script)]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.slow

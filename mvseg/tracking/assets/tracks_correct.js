@@ -74,9 +74,10 @@ class TrackWork {
   }
 
   say(op, one, other) {
-    this.note = `${this.nameOf(one)} and ${this.nameOf(other)}: ${op === "same_track" ? "the same" : "not the same"}.`;
+    const edit = { op, at: [this.placeOf(one), this.placeOf(other)] };
+    this.note = edit; // tracks may get other numbers: its words are those of the list
     pick(0);
-    this.edits.add({ op, at: [this.placeOf(one), this.placeOf(other)] });
+    this.edits.add(edit);
   }
 
   undo() {
@@ -131,7 +132,8 @@ class TrackWork {
     this.showQuestion();
     this.showEdits();
     const { problem, state, isStale, isComputing } = this.server;
-    const said = problem || [this.note, isComputing || !this.note ? state : ""].filter(Boolean).join(" ");
+    const note = typeof this.note === "string" ? this.note : `${this.describe(this.note)}.`;
+    const said = problem || [note, isComputing || !note ? state : ""].filter(Boolean).join(" ");
     find("note").classList.toggle("problem", Boolean(problem) || isStale);
     const reload = isStale ? [element("button", { type: "button" }, "Reload")] : [];
     reload.forEach((button) => button.addEventListener("click", () => window.location.reload()));

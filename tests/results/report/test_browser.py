@@ -80,6 +80,28 @@ def everywhere(leaf: int) -> dict[str, list[int]]:
     return {"table": [leaf], "photos": [leaf], "space": [leaf], "panel": [leaf]}
 
 
+def test_the_picture_in_3d_can_be_printed(opened: Viewer) -> None:
+    """It stays in its canvas, in its own proportions, and numbers are placed in parts of it."""
+    count = """() => {
+      const canvas = document.getElementById("canvas"), copy = document.createElement("canvas");
+      [copy.width, copy.height] = [canvas.width, canvas.height];
+      const brush = copy.getContext("2d");
+      brush.drawImage(canvas, 0, 0);
+      const { data } = brush.getImageData(0, 0, copy.width, copy.height);
+      return data.filter((value, n) => n % 4 === 3 && value > 0).length;
+    }"""
+    opened.page.wait_for_timeout(300)  # then a canvas that keeps nothing is empty
+    assert opened.page.evaluate(count) > 500
+    assert opened.page.locator("#space-labels span").first.evaluate("(each) => each.style.left").endswith("%")
+    box = "document.getElementById('canvas').getBoundingClientRect()"
+    ratio = f"() => {box}.width / {box}.height"
+    shown = opened.page.evaluate(ratio)
+    opened.page.emulate_media(media="print")
+    printed = opened.page.evaluate(ratio)
+    opened.page.emulate_media(media="screen")
+    assert printed == pytest.approx(shown, rel=0.05)
+
+
 def test_a_click_anywhere_selects_the_leaf_everywhere(opened: Viewer) -> None:
     nothing = {"table": [], "photos": [], "space": [], "panel": [0]}
     assert opened.selected() == nothing

@@ -62,7 +62,10 @@ class Space {
     for (const { leaf, text } of this.labels) {
       const { x, y, isAhead } = this.positionOf(leaf.id);
       text.style.visibility = isAhead ? "visible" : "hidden";
-      text.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+      // in parts of the picture, so that they stand beside their leaves on paper, too
+      text.style.left = `${((100 * x) / this.canvas.clientWidth).toFixed(2)}%`;
+      text.style.top = `${((100 * y) / this.canvas.clientHeight).toFixed(2)}%`;
+      text.style.transform = "translate(-50%, -50%)";
     }
   }
 
@@ -70,6 +73,7 @@ class Space {
     const { clientWidth, clientHeight } = this.canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
     this.renderer.setSize(clientWidth, clientHeight, false);
+    this.canvas.parentElement.style.setProperty("--aspect", clientWidth / clientHeight); // that of the print, too
     this.camera.aspect = clientWidth / clientHeight;
     if (this.shown !== null) this.lookThrough(this.shown);
     else this.camera.updateProjectionMatrix();
@@ -164,7 +168,7 @@ class Space {
 function buildSpace(data, addresses) {
   try {
     const canvas = document.getElementById("canvas");
-    const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true, preserveDrawingBuffer: true });
     renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     const space = new Space(data, addresses, renderer);
     space.listen();
