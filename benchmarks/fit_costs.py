@@ -147,7 +147,6 @@ def track_with(series: tuple[list[PlantOnDate], Labels], poses: Scales, links: S
         patch("mvseg.tracking.place_dates.fitted_costs", costs),
         patch("mvseg.tracking.compare.fitted_costs", costs),
         patch("mvseg.tracking.bent_costs.fitted_costs", costs),
-        patch("mvseg.tracking.motions.fitted_costs", costs),
     ):
         found = measure(truth, labels_of(track_leaves(dates), dates))
     return found["short"], found["long"]

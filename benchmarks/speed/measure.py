@@ -40,8 +40,8 @@ def main() -> None:
     args = parser.parse_args()
     wall, begun = time.perf_counter(), time.process_time()
     running.timed = measured  # before the stages take it from there
+    import mvseg.pipeline.learn  # noqa: F401
     from mvseg.config import RunConfig
-    from mvseg.pipeline import find_in_photos, learn  # noqa: F401
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.runs.request import RunRequest
 

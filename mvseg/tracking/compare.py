@@ -11,11 +11,9 @@ from mvseg.tracking.align import (
     Alignment,
     Habit,
     Poses,
-    guess_chance,
     judge,
     list_poses,
     pose_distances,
-    pose_gain,
     refine_alignment,
 )
 from mvseg.tracking.bent_costs import bent_costs
@@ -23,7 +21,6 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import DateLeaves, Pair
-from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
@@ -42,7 +39,6 @@ class Comparison:
         trust: (T, T) probability that two dates stand to each other as `poses` says.
         otherwise: {(earlier, later): (N, M) probability that their leaves are the same if another pose is right}: the
             mean over the other poses, weighted by their probabilities; 0 without any.
-        motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
 
     costs: Mapping[tuple[int, int], Floats]
@@ -50,7 +46,6 @@ class Comparison:
     roots: np.ndarray
     trust: Floats
     otherwise: Mapping[tuple[int, int], Floats]
-    motions: Mapping[tuple[int, int], Motion]
 
 
 def compare_dates(
@@ -81,7 +76,6 @@ def compare_dates(
     trust = np.eye(len(dates))
     costs: dict[tuple[int, int], Floats] = {}
     otherwise: dict[tuple[int, int], Floats] = {}
-    motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
         pair, pose = pairs[earlier, later], step_between(poses, (earlier, later))
         alignment = refine_alignment(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
@@ -91,21 +85,10 @@ def compare_dates(
             continue
         costs[earlier, later] = bent_costs(pair, alignment)
         otherwise[earlier, later] = _under_others(poses_of_pairs[earlier, later], pose, habit)
-        is_step = roots[later] not in roots[earlier + 1 : later]
-        if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
-            motion = find_motion(pair, alignment.pose)
-            if motion is not None:
-                both = pose_gain(pair, alignment.pose) + motion.gain
-                if motion.is_sure:  # the other turn is that of a second plant
-                    trust[earlier, later] = max(trust[earlier, later], guess_chance(both, pair.fewer))
-                motions[earlier, later] = motion
-                costs[earlier, later] = _parted_costs(pair, motion, costs[earlier, later])
     trust = np.maximum(trust, trust.T)
     for date in range(len(dates)):  # by way of others
         trust = np.maximum(trust, np.minimum(trust[:, date, None], trust[None, date]))
-    return Comparison(
-        costs=costs, poses=poses, roots=roots, trust=trust, otherwise=otherwise, motions=motions
-    )  # fmt: skip
+    return Comparison(costs=costs, poses=poses, roots=roots, trust=trust, otherwise=otherwise)
 
 
 def _under_others(of_pair: Poses, pose: Floats, habit: Habit) -> Floats:
@@ -121,17 +104,3 @@ def _under_others(of_pair: Poses, pose: Floats, habit: Habit) -> Floats:
             rivals = odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds
             chances += weight * odds / (1 + rivals)
     return chances
-
-
-def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
-    """The costs where the leaves of a second motion are linked with each other only, and only if it is sure."""
-    rows, columns = motion.pairs.T
-    parted = costs.copy()
-    none = LINKING.unlinked
-    parted[rows], parted[:, columns] = np.maximum(parted[rows], none), np.maximum(parted[:, columns], none)
-    if motion.is_sure:
-        part = pair.take(rows, columns)
-        alignment = refine_alignment(part, motion.pose)
-        if len(alignment.pairs):
-            parted[np.ix_(rows, columns)] = bent_costs(part, alignment)
-    return parted

@@ -47,14 +47,6 @@ class AlignNumbers:
 
 
 @dataclass(frozen=True)
-class MotionNumbers:
-    """Two parts of a plant that have moved apart."""
-
-    least_gain: float = 20.0  # chosen: log odds from which a second motion is believed
-    sure_margin: float = 7.0  # chosen: log odds of it over each other one from which it is sure, where two turns fit
-
-
-@dataclass(frozen=True)
 class CostNumbers:
     """Costs of pairs of leaves."""
 
@@ -91,7 +83,6 @@ class PageNumbers:
 
 OBSERVATIONS = ObservationNumbers()
 ALIGN = AlignNumbers()
-MOTIONS = MotionNumbers()
 COSTS = CostNumbers()
 LINKING = LinkNumbers()
 PAGE = PageNumbers()

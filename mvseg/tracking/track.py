@@ -241,11 +241,6 @@ def _find_doubts(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator
         if chance < ALIGN.told:
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
             yield Finding("pot_guessed", pair, {"likely": f"{chance:.0%}" if chance >= 0.01 else "less than 1%"})
-    for (earlier, later), motion in sorted(compared.motions.items()):
-        if compared.roots[later] not in compared.roots[earlier + 1 : later]:
-            pair = f"{dates[earlier].scene} and {dates[later].scene}"
-            code = "moved_apart" if motion.is_sure else "moved_apart_unsure"
-            yield Finding(code, pair, {"count": len(motion.pairs)})
     if not all(date.knows_up for date in dates):
         yield Finding("dates_without_up")
     if shapeless := sum(len(date.leaves) - len(date.shaped) for date in dates):

@@ -12,9 +12,7 @@ from scipy.spatial.transform import Rotation
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
-from mvseg.tracking.align import Habit, list_poses
 from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.track import track_leaves
 from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
 
@@ -93,13 +91,13 @@ def test_a_repotted_plant_is_linked_by_guesses_that_say_so() -> None:
     assert max(guessed, default=0) < 0.9 < min(sure)
 
 
-def two_in_a_pot(turn: float, other: Blades, *, count: int = 2) -> tuple[list[PlantOnDate], list[list[int]]]:
+def two_in_a_pot(turn: float, other: Blades) -> tuple[list[PlantOnDate], list[list[int]]]:
     """Two plants side by side; after the first date the second one is set back, turned against the first."""
     pot = Rotation.from_euler("z", turn, degrees=True)
     still = {leaf + 10: blade + (250.0, 0, 0) for leaf, blade in other.items()}
     turned = {leaf + 10: pot.apply(blade.reshape(-1, 3)).reshape(blade.shape) + (250.0, 0, 0)
               for leaf, blade in other.items()}  # fmt: skip
-    seen = [see(BLADES | (turned if day else still), day, turn=50 * day) for day in range(count)]
+    seen = [see(BLADES | (turned if day else still), day, turn=50 * day) for day in range(2)]
     return [date for date, _ in seen], [truth for _, truth in seen]
 
 
@@ -111,34 +109,10 @@ def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
 
-@pytest.mark.parametrize(("turn", "count"), [(60, 2), (120, 2), (200, 2), (60, 3)])
-def test_two_plants_that_moved_against_each_other_are_linked_each_by_itself(turn: float, count: int) -> None:
-    dates, truths = two_in_a_pot(turn, grow_blades(8, 31), count=count)
-    tracks = track_leaves(dates)
-    assert tracks.findings == (Finding("moved_apart", "day-0 and day-1", {"count": 8}),)
-    assert tracks.num_tracks == 18
-    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
-
-
-def test_two_plants_of_one_size_are_aligned_although_each_moved_otherwise() -> None:
-    """Each of the two poses explains one of them: that is not one pot that could be turned in two ways."""
-    dates, truths = two_in_a_pot(60, grow_blades(10, 66))
-    one, other = (leaves_of(date) for date in dates)
-    pair = Pair.of(one, other, days=1, knows_up=True)
-    weights = np.sort(list_poses(pair).weights(Habit()))[::-1]
-    assert weights[1] > 0.05 * weights[0]
-    assert all(len(leaves) == 1 for leaves in true_tracks(track_leaves(dates), truths).values())
-    assert track_leaves(dates).num_tracks == 20
-
-
-def test_a_second_plant_that_could_have_been_turned_in_more_than_one_way_is_not_linked() -> None:
-    half = grow_blades(4, 5)
-    same = half | {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # looks the same from two sides
-    dates, truths = two_in_a_pot(60, same)
-    tracks = track_leaves(dates)
-    assert tracks.findings[0].code == "moved_apart_unsure"
-    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
-    assert tracks.num_tracks == 10 + 2 * 8
+def test_a_plant_whose_neighbour_was_turned_in_the_pot_keeps_its_own_tracks() -> None:
+    dates, truths = two_in_a_pot(120, grow_blades(8, 31))
+    tracks = [found for found in true_tracks(track_leaves(dates), truths).values() if found & set(BLADES)]
+    assert sorted(tracks, key=min) == [{leaf} for leaf in sorted(BLADES)]
 
 
 def test_a_plant_with_one_leaf_and_a_date_without_leaves() -> None:
