@@ -41,7 +41,7 @@ def run(args: Namespace) -> int:
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
     metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
     agreement = compare_annotators(regions, ids, truth)
-    metrics |= {"kappa": agreement.kappa, "alone": agreement.alone, "missed": agreement.missed}
+    metrics |= {"alone": agreement.alone, "missed": agreement.missed}
     metrics |= {f"iou_{each.leaf}_{each.true}": each.iou for each in agreement.shared}
     if metrics["no_instance"]:
         message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: left out of the scores of the ids"

@@ -22,9 +22,7 @@ class TraitsConfig:
             not judged by it.
         min_visible_share: of the pixels that a leaf's surface covers in the photos, its masks must cover this share; in
             [0, 1]. A surface that is hardly visible in any photo is in the wrong place.
-        leaves_only: leave out what looks like a stem (long and steep, and a surface explains its masks badly), the
-            floor (below everything else, and far larger) or something beside the plant (more than two leaf lengths away
-            from it). Stems and the floor are recognised only if up is known.
+        leaves_only: leave out what looks like a stem: slender for its plant, and a tube explains its masks.
         stems: auto: find the stems that the leaves sit on, with their nodes (docs/traits.md), where leaves and photos
             agree about them; off: do not look for any.
     """

@@ -175,7 +175,6 @@ def measure_plant(
     tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
     rejected = find_rejected(
         shapes,
-        None if frame is None else frame[2],
         config=config,
         sure_views=sure_views,
         visible_shares=visible,

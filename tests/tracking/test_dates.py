@@ -130,7 +130,7 @@ def test_a_date_read_back_is_that_of_the_result_in_memory(tmp_path: Path) -> Non
 
 
 def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
-    write_result(tmp_path / "day", grow_blades(3, 1), shapeless=[2], rejected={3: "floor"})
+    write_result(tmp_path / "day", grow_blades(3, 1), shapeless=[2], rejected={3: "low_quality"})
     date = read_date(tmp_path / "day", 0)
     assert [(leaf.leaf, leaf.midrib is None) for leaf in date.leaves] == [(1, False), (2, True)]
     assert date.shaped == [0]
