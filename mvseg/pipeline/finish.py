@@ -132,7 +132,7 @@ def _find_missing(plant: Plant, result: Result) -> Finding | None:
 def _find_doubtful(result: Result, *, has_stems: bool) -> Finding | None:
     of_stems = result.masks.instance_ids[result.masks.classes == STEM_CLASS].tolist() if has_stems else ()
     surfaces = {leaf: each for leaf, each in (result.surfaces or {}).items() if leaf not in of_stems}
-    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_harmless)
+    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good)
     if not leaves:
         return None
     values: Values = {"count": len(leaves), "total": len(surfaces), "leaves": leaves}

@@ -189,9 +189,6 @@ class QualityNumbers:
     least_iou: float = 0.8  # chosen: min. median IoU; below it, a surface is doubted
     credible_iou: float = 0.7  # chosen: median IoU from which measures are given; buds, fruit and stems have less
     most_area_share: float = 0.1  # chosen: max. deviation of the area, as a share of it; above, it is doubted
-    # A deep cup that most views look into shows in one view what it is; ovate leaves lack 0.02 at most.
-    clean_iou: float = 0.95  # chosen: median IoU above which it is doubted if it lacks too much of a single mask
-    most_lacking: float = 0.05  # chosen: max. part of a mask that the surface lacks, as a share of the median mask
     # A patch fills the bays of a star: 2.5 % of it lie there, of leaves, hearts and rectangles 0.5 % at most.
     least_shown: float = 0.2  # chosen: share of the masks that show a part, below which it is not shown
     most_unshown: float = 0.02  # chosen: share of its area that is not shown, above which it is doubted

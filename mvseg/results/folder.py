@@ -30,7 +30,6 @@ from mvseg.results.photo_masks import labels_in_photo, mask_in_photo
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.results.run_record import FORMAT
-from mvseg.results.scale_bar import fit_scale_bars
 from mvseg.scene import Scene, View
 from mvseg.system.running import progress_bar
 
@@ -130,13 +129,13 @@ def photos_folder(view: View) -> Path:
 def _write_images(result: Result, folder: Path) -> list[Picture]:
     """Write labels and overlays; returns the report's pictures, so that photos are read only once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
-    pictures, bars = [], fit_scale_bars(result)
+    pictures = []
     views = list(enumerate(scene.views))
     for index, view in progress_bar(views, name="writing pictures", unit="view"):
         width, height = scene.cameras.sizes[index].tolist()
         write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
-        drawn = draw_overlay(photo, masks, view=index, bar=bars[index])
+        drawn = draw_overlay(photo, masks, view=index)
         pictures.append(draw_picture(photo, masks, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)

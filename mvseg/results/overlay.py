@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 
 from mvseg.masks import SURE, Masks
-from mvseg.results.scale_bar import ScaleBar
 
 MAX_SIDE = 1600  # limit: max. pixels of an overlay's longer side
 MARGIN = 0.06  # limit: margin around the plant in a picture, as a share of its longer side
@@ -31,14 +30,13 @@ def instance_color(instance: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int, bar: ScaleBar | None = None) -> np.ndarray:
+def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     """Tint the masks of one view in the colours of their instances, with contour and number.
 
     Unmatched ones are grey and have no number; numbers get a question mark where the match score is below 0.5.
 
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
-        bar: a scale bar for the lower left corner.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -70,8 +68,6 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int, bar: ScaleBar | 
             numbers.append((f"{instance}{doubt}", (x + column, y + row), radius))
     letters = max(0.35, longer / 1100)
     ink = _write(numbers, size, scale=letters)
-    if bar is not None:
-        _draw_bar(ink, bar, scale=letters)
     _print(painted, ink, scale=letters)
     return painted
 
@@ -108,16 +104,6 @@ def _write(numbers: Sequence[_Number], size: tuple[int, int], *, scale: float) -
         corner = (column - width // 2, row + height // 2)
         cv2.putText(ink, text, corner, cv2.FONT_HERSHEY_SIMPLEX, own, 255, max(1, round(2 * own)), cv2.LINE_AA)
     return ink
-
-
-def _draw_bar(ink: np.ndarray, bar: ScaleBar, *, scale: float) -> None:
-    """A bar, and its length above it."""
-    height, width = ink.shape
-    margin, thickness = round(CAPITAL * scale), max(2, round(5 * scale))
-    left, bottom = margin, height - margin
-    ink[bottom - thickness : bottom, left : left + max(1, round(bar.share * width))] = 255
-    place = (left, bottom - 2 * thickness)
-    cv2.putText(ink, bar.text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
 
 
 def _print(canvas: np.ndarray, ink: np.ndarray, *, scale: float) -> None:

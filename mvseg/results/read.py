@@ -321,9 +321,7 @@ def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
     nodes = _find_file(folder, run, "nodes.csv")
     unit = world.unit or ""
     up_from = world.up_from or ("" if world.up is None else "scene")  # earlier versions took no other
-    return read_traits(
-        *paths, nodes, plant=scene.name, unit=unit, up=world.up, up_from=up_from, rejected=world.kinds
-    )
+    return read_traits(*paths, nodes, plant=scene.name, unit=unit, up=world.up, up_from=up_from, rejected=world.kinds)
 
 
 def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: Traits | None) -> Instances:

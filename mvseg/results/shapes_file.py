@@ -110,16 +110,18 @@ def read_voxels(path: Path) -> dict[int, VoxelGrid]:
     try:
         if not (np.isfinite(arrays["origin"]).all() and np.isfinite(arrays["voxel_size"]).all()):
             raise ValueError("a grid lies at no place")
-        return ByInstance({
-            int(leaf): VoxelGrid(
-                origin=torch.from_numpy(arrays["origin"][row].copy()),
-                voxel_size=float(arrays["voxel_size"][row]),
-                votes=torch.from_numpy(arrays[f"votes_{leaf}"]),
-                num_views=int(arrays["num_views"][row]),
-                threshold=float(arrays["threshold"][row]),
-            )
-            for row, leaf in enumerate(arrays["leaf"].tolist())
-        })
+        return ByInstance(
+            {
+                int(leaf): VoxelGrid(
+                    origin=torch.from_numpy(arrays["origin"][row].copy()),
+                    voxel_size=float(arrays["voxel_size"][row]),
+                    votes=torch.from_numpy(arrays[f"votes_{leaf}"]),
+                    num_views=int(arrays["num_views"][row]),
+                    threshold=float(arrays["threshold"][row]),
+                )
+                for row, leaf in enumerate(arrays["leaf"].tolist())
+            }
+        )
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no voxels that mvseg wrote ({error})") from None
 

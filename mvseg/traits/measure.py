@@ -15,7 +15,7 @@ from mvseg.errors import check_arguments
 from mvseg.formats.photos import Photos
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
-from mvseg.reconstruction.surface.leaf_surface import HARMLESS, LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
@@ -73,7 +73,7 @@ class LeafTraits:
             return "no"
         if self.method != "surface":
             return "look"
-        return "no" if USELESS & self.reasons.keys() else "yes" if self.reasons.keys() <= HARMLESS else "look"
+        return "no" if USELESS & self.reasons.keys() else "look" if self.reasons else "yes"
 
     def __repr__(self) -> str:
         area, length = self.numbers["area"], self.numbers["length"]

@@ -37,7 +37,6 @@ from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
-from mvseg.results.scale_bar import fit_scale_bars
 from mvseg.system.file_hash import hash_files
 from mvseg.traits.measure import measure_plant
 from scene_folders import (
@@ -352,21 +351,6 @@ WRITERS = [
 
 OF_A_PLANT = ("write_voxels", "write_ply", "write_glb", "write_long", "write_wide")
 SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_picture", "write_png", "write_ply")
-
-
-def test_scale_bars_are_as_long_as_the_plant_shows_them(result: Result) -> None:
-    cameras, middle = result.scene.cameras, torch.tensor(BALLS, dtype=torch.float64)[:, :3].median(0).values
-    for view, bar in enumerate(fit_scale_bars(result)):
-        assert bar is not None
-        length, unit = bar.text.split()
-        assert unit == "mm"
-        assert 0.07 < bar.share <= 0.2
-        ends = torch.stack([middle, middle + float(length) * cameras.R[view, 0]])  # parallel to the photo
-        seen = torch.cat([ends, torch.ones(2, 1)], 1) @ cameras.px_from_world[view].T
-        pixels = float((seen[1] / seen[1, 2] - seen[0] / seen[0, 2]).norm())
-        assert bar.share * WIDTH == pytest.approx(pixels, rel=0.02)
-    unknown = replace(result, scene=replace(result.scene, unit=""))
-    assert fit_scale_bars(ids_only(result)) == fit_scale_bars(unknown) == [None] * 4
 
 
 class TestWholeOrNotAtAll:

@@ -19,7 +19,6 @@ from mvseg.results.overlay import (
     find_plant,
     instance_color,
 )
-from mvseg.results.scale_bar import ScaleBar
 
 GREY = np.full((200, 300, 3), 90, np.uint8)
 
@@ -54,18 +53,6 @@ def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
     assert (second[30:50, 250:270] == tint).all()
     assert (first[:, 190:] == 90).all()  # outside nothing changes
     assert (GREY == 90).all()
-
-
-def test_a_scale_bar_has_its_length(regions: Regions) -> None:
-    plain, measured = (
-        draw_overlay(GREY, masks(regions, [-1] * 4), view=1, bar=bar) for bar in (None, ScaleBar(0.2, "5 mm"))
-    )
-    changed = (plain != measured).any(2)
-    assert changed[100:, :150].sum() == changed.sum()  # in the lower left corner
-    black = (measured == 0).all(2)
-    assert black.sum(1).max() == 60  # of 300 pixels
-    rows = np.flatnonzero(black.sum(1) == 60)
-    assert (measured[100 : rows[0] - 1, :150] < 60).all(2).any()  # its text, above
 
 
 def test_drawing_in_the_box_of_a_mask_is_drawing_in_the_whole_picture() -> None:

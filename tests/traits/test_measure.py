@@ -119,8 +119,7 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     ("method", "codes", "use"),
     [
         ("surface", [], "yes"),
-        ("surface", ["shows_more"], "yes"),
-        ("surface", ["shows_more", "two_views"], "look"),
+        ("surface", ["two_views"], "look"),
         ("surface", ["poor_fit"], "no"),
         ("voxels", ["no_blade", "poor_fit"], "look"),  # voxels do not depend on the surface
         ("none", ["one_view"], "no"),

@@ -274,14 +274,12 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: boo
     points = patch_grid(*FIT.grid).points(fit.coefficients)
     grown = np.nan_to_num(fit.offsets_px)
     drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=grown, is_blurred=False) >= 0.5
-    iou, inside = crop_ious(masks, drawn), masks.inside.sum((1, 2))
-    lacking = float(((masks.inside & ~drawn).sum((1, 2)) / np.median(inside)).max())
     surface = LeafSurface(
         coefficients=torch.from_numpy(fit.coefficients),
         covariance=torch.from_numpy(fit.covariance),
         views=torch.from_numpy(masks.views),
         residual_px=torch.from_numpy(fit.residual_px * masks.pixel_size),
-        iou=torch.from_numpy(iou),
+        iou=torch.from_numpy(crop_ious(masks, drawn)),
         is_oriented=False,
         quality=Quality(),
         offsets_px=torch.from_numpy(offsets),
@@ -292,7 +290,7 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: boo
         surface = replace(surface, covariance=wider * surface.covariance)
     if not is_judged:
         return surface
-    return replace(surface, quality=Quality(_judge(surface, lacking) | _judge_shape(masks, points)))
+    return replace(surface, quality=Quality(_judge(surface) | _judge_shape(masks, points)))
 
 
 def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
@@ -316,8 +314,8 @@ def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
     return reasons
 
 
-def _judge(surface: LeafSurface, lacking: float) -> dict[str, str]:
-    """The reasons to doubt a fit; what it lacks of one of its masks is `lacking`, as a share of the median mask."""
+def _judge(surface: LeafSurface) -> dict[str, str]:
+    """The reasons to doubt a fit."""
     reasons = {}
     if not surface.is_credible:
         reasons["no_blade"] = "no leaf, or its masks contradict each other: no single blade explains them"
@@ -326,8 +324,6 @@ def _judge(surface: LeafSurface, lacking: float) -> dict[str, str]:
     iou = float(surface.iou.median())
     if iou < DOUBTS.least_iou:
         reasons["poor_fit"] = f"the surface explains its masks badly (median IoU {iou:.2f})"
-    if iou > DOUBTS.clean_iou and lacking > DOUBTS.most_lacking:
-        reasons["shows_more"] = f"one view shows more than its surface, by {100 * lacking:.0f} % of a mask"
     share = surface.deviations[0] / surface.area
     if share > DOUBTS.most_area_share:
         reasons["uncertain_area"] = f"its area is uncertain by {100 * share:.0f} %"

@@ -30,9 +30,6 @@ from mvseg.scene import Cameras
 T = TypeVar("T")
 MESH_SHAPE = (64, 17)  # definition: a mesh has so many rows and columns of vertices
 
-# Codes of reasons with which areas are as good as without (`python benchmarks/traits.py`, docs/traits.md).
-HARMLESS = {"shows_more"}
-
 
 @dataclass(frozen=True)
 class Quality:
@@ -48,11 +45,6 @@ class Quality:
     def is_good(self) -> bool:
         """Whether there is no reason to doubt it."""
         return not self.reasons
-
-    @property
-    def is_harmless(self) -> bool:
-        """Whether there is no reason to doubt its area (`HARMLESS`)."""
-        return self.reasons.keys() <= HARMLESS
 
 
 class ByInstance(dict[int, T]):

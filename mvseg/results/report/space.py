@@ -7,6 +7,7 @@ radius of 1.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,7 +23,6 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.report.stems import parts_of
 from mvseg.results.result import Result
-from mvseg.results.scale_bar import round_length
 from mvseg.results.stem_shapes import StemPart
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import level_frame
@@ -135,7 +135,9 @@ def describe_cameras(cameras: Cameras, frame: Frame) -> list[dict[str, Any]]:
 
 def grid_step(radius: float) -> float:
     """Side of the squares of the grid: 1, 2 or 5 times a power of ten, a fifth to a half of the plant's radius."""
-    return round_length(radius / 2)
+    most = radius / 2
+    power = 10 ** math.floor(math.log10(most))
+    return max(step * power for step in (1, 2, 5) if step * power <= most)
 
 
 def _describe_part(part: StemPart, frame: Frame) -> dict[str, Any]:
