@@ -199,7 +199,6 @@ class Regions:
         return thinned, first, torch.tensor(steps, dtype=torch.int64, device=self.device)
 
     def _parts(self) -> tuple[Tensor, ...]:
-        """D views into `crops`, one per region, flat."""
         return self.crops.split(self.crop_sizes.prod(1).tolist())
 
     def runs(self, longest: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -315,7 +314,6 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Region
 
 
 def _slices(box: np.ndarray) -> tuple[slice, slice]:
-    """Rows and columns of a box (4,)."""
     x1, y1, x2, y2 = box.tolist()
     return slice(y1, y2), slice(x1, x2)
 

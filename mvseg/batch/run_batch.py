@@ -156,7 +156,6 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
 
 
 def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:
-    """The status of a scene whose worker died twice."""
     sentence = f"the process that worked on this scene {lost.reason}, twice"
     folder = scene_state(out, scene.name)
     status = Status(state="failed", scene=str(scene.folder), sentence=sentence)

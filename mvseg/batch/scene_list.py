@@ -158,6 +158,5 @@ def _columns_of_results() -> set[str]:
 
 
 def _name_of(path: str) -> str:
-    """The parts of a path in one name, without a drive: "day-1/basil" is "day-1_basil"."""
     parts = re.sub(r"^[A-Za-z]:[\\/]", "", path).replace("\\", "/").split("/")
     return "_".join(part for part in parts if part not in ("", ".", ".."))

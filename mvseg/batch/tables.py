@@ -50,7 +50,6 @@ def read_batch_table(batch: Path, name: str, columns: Sequence[str]) -> list[dic
 
 
 def _about(scene: BatchScene) -> tuple[Cell, ...]:
-    """The first cells of a row: the scene and its cells of the batch's table."""
     return scene.name, *scene.carried.values()
 
 
@@ -64,7 +63,6 @@ def _outcome(status: Status) -> tuple[Cell, ...]:
 def _join(
     path: Path, columns: Sequence[str], scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]
 ) -> None:
-    """Join the tables of the scenes, which have these columns, behind the cells of the batch's table."""
     shared = [column for column in columns if column not in carried]
     rows = [
         [*_about(scene), *(row[column] for column in shared)]

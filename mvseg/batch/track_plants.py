@@ -114,7 +114,6 @@ def track_plants(
 
 @contextmanager
 def _open(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """Open workers as `open_workers` does; a single one is this process."""
     if scheduler is None and num_workers == 1:
         yield lambda items, _: ((index, work(item)) for index, item in items.items())
     else:
@@ -129,7 +128,6 @@ def _or_failed(answer: TrackedPlant | Lost, plant: PlantResults) -> TrackedPlant
 
 
 def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots: Pots, report: bool) -> TrackedPlant:
-    """Track one plant and write its tables, and its page, into its place."""
     plant, place = item
     try:
         dates = plant.read(pictures=PAGE.side if report else 0)

@@ -63,7 +63,6 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
 
 
 def _is_done(status: Status, result: Path) -> bool:
-    """Whether the result of a status exists."""
     run = result / RUN_FILE
     if status.state != "done" or not run.is_file() or hash_files(run) != status.result:
         return False
@@ -89,7 +88,6 @@ def _finish(request: RunRequest, *, cache: Path) -> Status:
 
 
 def _describe_failure(error: Exception, scene: BatchScene) -> Status:
-    """The sentence of a failure; bad input needs no trace."""
     trace = ""
     if isinstance(error, InputError):
         sentence = str(error)

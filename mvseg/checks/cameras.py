@@ -199,7 +199,6 @@ def _other_reading(cameras: Cameras, coverage: Coverage) -> Rule | None:
 
 
 def _widest_angle(cameras: Cameras, coverage: Coverage) -> float:
-    """Degrees between the most different rays of the cameras that look at the point; 0 if fewer than two do."""
     toward = coverage.point - cameras.centers.numpy()[coverage.sees]
     toward /= np.linalg.norm(toward, axis=1, keepdims=True).clip(min=1e-300)
     return float(np.degrees(np.arccos(np.clip(toward @ toward.T, -1, 1).min()))) if len(toward) > 1 else 0.0

@@ -112,7 +112,6 @@ def _median_px(matches: Sequence[PhotoMatches], cameras: Cameras, factor: float 
 
 
 def _fitting_share(pair: PhotoMatches, cameras: Cameras) -> float:
-    """Share of the features that fit one fundamental matrix, of which that of the cameras is fitted, too."""
     fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < FEATURES.offset * pair.unit_px
     return float(fits.sum() / pair.is_rigid.sum())
 

@@ -53,7 +53,6 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
 
 
 def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:
-    """Two groups of the members that contradict each other; None where they are of one world."""
     if len(members) < 2 * AGREEMENT.smallest:
         return None
     order = members[_order(pairs, members)]
@@ -92,10 +91,8 @@ def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int6
 
 
 def _block(values: Floats, one: NDArray[np.int64], other: NDArray[np.int64]) -> Floats:
-    """The values of all pairs between two groups."""
     return np.asarray(values[np.ix_(one, other)].ravel())
 
 
 def _upper(values: Floats, members: NDArray[np.int64]) -> Floats:
-    """The values of all pairs within a group."""
     return np.asarray(values[np.ix_(members, members)][np.triu_indices(len(members), 1)])

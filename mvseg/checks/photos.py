@@ -104,7 +104,6 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
 
 
 def _exposure_rules(facts: list[PhotoFacts]) -> list[Rule]:
-    """Photos of another exposure than most, where two or more say theirs."""
     exposures = np.array([each.exposure for each in facts])
     if np.isfinite(exposures).sum() < 2:
         return []

@@ -154,7 +154,6 @@ def is_sure(pairs: PoseAgreement) -> bool:
 
 
 def _against(pairs: PoseAgreement, agreeing: list[int]) -> tuple[Floats, Floats]:
-    """(V,) fitting share and median offset of every view against the remaining ones; NaN without any."""
     fitting, offset = np.full((2, len(pairs.fitting)), np.nan)
     for view in range(len(fitting)):
         others = [other for other in agreeing if other != view and pairs.num_masks[view, other]]
@@ -180,7 +179,6 @@ def _hull_corners(regions: Regions) -> Tensor:
 
 
 def _hull(regions: Regions, index: int) -> Tensor:
-    """(P, 2) float64, the corners of a region's hull, pixel centres."""
     corners = cv2.convexHull(cv2.findNonZero(without_small_components(regions.crop(index).numpy())))[:, 0]
     return torch.from_numpy(corners + regions.boxes[index, :2].numpy() + 0.5)
 

@@ -65,7 +65,6 @@ def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool
 
 
 def _fill(polygon: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """(h, w) bool: a polygon in pixels, about."""
     filled = np.zeros(size, np.uint8)
     corners = np.round((polygon - 0.5) * (1 << IMAGES.shift)).astype(np.int32)
     return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=IMAGES.shift), bool)

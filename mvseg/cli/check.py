@@ -67,7 +67,6 @@ def run(args: Namespace) -> int:
 
 
 def _check_folder(args: Namespace) -> tuple[Check, tuple[Finding, ...], InputError | None]:
-    """The check of a scene folder, all findings, and why its masks cannot be read."""
     from mvseg.checks.check_scene import check_scene
     from mvseg.formats.scene_folder import load_masks, load_scene
     from mvseg.runs.request import find_given
@@ -89,7 +88,6 @@ def _check_folder(args: Namespace) -> tuple[Check, tuple[Finding, ...], InputErr
 
 
 def _check_result(folder: Path) -> tuple[Check, tuple[Finding, ...]]:
-    """The check of the scene and the masks of a result, and what else its run found."""
     from mvseg.checks.check_scene import check_scene
     from mvseg.results.read import load_result
 
@@ -154,7 +152,6 @@ def _print_table(check: Check, place: Path) -> None:
 
 
 def _rows(check: Check) -> list[dict[str, Any]]:
-    """The rows of the table and of check.json, one per view; None where a value is unknown."""
     from mvseg.checks.masks import touches_border
     from mvseg.checks.poses import view_agreement
 

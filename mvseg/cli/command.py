@@ -102,7 +102,6 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """Print input warnings without their line of code; other warnings are for developers."""
     text = f"mvseg: warning: {message}\n"
     if not issubclass(category, InputWarning):
         text = warnings.formatwarning(message, category, filename, lineno, line)
@@ -149,7 +148,6 @@ def build_parser(*, short: bool = False) -> ArgumentParser:
 
 
 def _list_names(words: Sequence[str]) -> list[str]:
-    """The options of the verb that was typed; without one, the verbs and the options that need none."""
     verb = next((word for word in words if not word.startswith("-")), "")
     if verb not in VERBS:
         return [*VERBS, "--help", "--version"]
@@ -159,15 +157,12 @@ def _list_names(words: Sequence[str]) -> list[str]:
 
 
 class _Help(DefaultHelpFormatter):
-    """Help with the types as people know them."""
-
     def _get_type_str(self, action: argparse.Action) -> str | None:
         text = super()._get_type_str(action)
         return None if text is None else text.replace("<class 'Path'>", "Path")
 
 
 def _shorten_help(verb: str, parser: ArgumentParser) -> None:
-    """Let the help of a verb show its most used options only, without their types."""
     places = []
     for action in parser._actions:
         if action.dest != "help" and action.dest not in MOST_USED[verb]:

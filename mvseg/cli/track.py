@@ -73,7 +73,6 @@ def run(args: Namespace) -> int:
 
 
 def _read_again(args: Namespace) -> RecordedTracks:
-    """The run that --again names."""
     from mvseg.system.atomic import sweep_abandoned
     from mvseg.tracking.recorded import read_recorded_tracks
 
@@ -86,7 +85,6 @@ def _read_again(args: Namespace) -> RecordedTracks:
 
 
 def _read_results(args: Namespace) -> RecordedTracks:
-    """Read the results that the command line names."""
     from mvseg.batch.track_plants import list_plants
     from mvseg.tracking.recorded import PlantResults, RecordedTracks
 

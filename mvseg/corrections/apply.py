@@ -41,8 +41,6 @@ class _Tie(NamedTuple):
 
 
 class _About(NamedTuple):
-    """An edit about the whole instance of a mask."""
-
     edit: int
     mask: Key
     rejects: bool
@@ -353,13 +351,11 @@ def _remaining_mask_at(edited: _Edited, number: int, place: Place, scene: Scene)
 
 
 def _masks_at(place: Place, masks: Sequence[EditedMask], scene: Scene) -> list[EditedMask]:
-    """Masks among these that contain a place."""
     view, column, row = _pixel_at(scene, place)
     return [mask for mask in masks if mask.view == view and mask.crop.holds(column, row)]
 
 
 def _pixel_at(scene: Scene, place: Place) -> tuple[int, int, int]:
-    """View, column and row of a place in the undistorted photo."""
     name, x, y = place
     view = _view(scene, name)
     column, row = np.floor(_to_pinhole(scene, view, [(x, y)])[0]).astype(int).tolist()
@@ -367,7 +363,6 @@ def _pixel_at(scene: Scene, place: Place) -> tuple[int, int, int]:
 
 
 def _view(scene: Scene, name: str) -> int:
-    """The index of the view that a name refers to, see `find_views`."""
     with suppress(InputError):  # it fits several
         (view,) = find_views([name], scene, source=Path("corrections"))
         if view is not None:
@@ -376,7 +371,6 @@ def _view(scene: Scene, name: str) -> int:
 
 
 def _to_pinhole(scene: Scene, view: int, points: Sequence[Point]) -> NDArray[np.float64]:
-    """(P, 2) points of a photo in its undistorted pixels."""
     xy, lens = np.array(points, np.float64), scene.views[view].lens
     if lens is not None:
         xy = pinhole_from_photo(lens, scene.cameras.K[view].cpu().numpy(), xy)

@@ -32,8 +32,6 @@ DatedPlace = tuple[Text, Text, Pixel, Pixel]  # scene, view, x, y
 
 
 class _Edit(BaseModel):
-    """Author and time of an edit, which are kept unchanged."""
-
     model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
     by: Text | None = None
     when: Text | Number | None = None
@@ -177,6 +175,5 @@ def name_edits(edits: Sequence[Edit]) -> str:
 
 
 def _plain(text: object, most: int = 60) -> str:
-    """Text of a user for a message: one line, not long."""
     line = str(text).encode("unicode_escape").decode()
     return line if len(line) <= most else f"{line[: most - 3]}..."

@@ -138,7 +138,6 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
 
 
 def _ask_matches(masks: Masks) -> list[MaskQuestion]:
-    """Low match scores; and masks of some size that were matched to nothing."""
     ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
     usual = _usual_area(masks)
     questions = []
@@ -152,7 +151,6 @@ def _ask_matches(masks: Masks) -> list[MaskQuestion]:
 
 
 def _usual_area(masks: Masks) -> float:
-    """The median area of the matched masks, pixels."""
     matched = masks.regions.areas[masks.instance_ids > 0].float()
     return max(float(matched.median()), 1.0) if len(matched) else 1.0
 
@@ -256,7 +254,6 @@ def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
 
 
 def _ask_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[MaskQuestion]:
-    """The mask of each leaf that its surface explains worst."""
     questions = []
     for instance, surface in surfaces.items():
         if not surface.exists:

@@ -79,7 +79,6 @@ def _op(link: LeafLink) -> str:
 
 
 def _is_contradiction(links: Sequence[LeafLink]) -> bool:
-    """Whether links would join two leaves of a date, or two that another link keeps apart."""
     part_of: dict[tuple[str, int], set[tuple[str, int]]] = {}
     for link in links:
         if link.is_same:
@@ -106,7 +105,6 @@ def leaf_at(folder: Path, view: str, x: float, y: float) -> int:
 
 
 def _find_labels(folder: Path, view: str) -> Path | None:
-    """The label image of a view; None where none is named so, or several are."""
     labels_of = {path.relative_to(folder).as_posix().removesuffix(".png"): path for path in folder.rglob("*.png")}
     name = view.replace("\\", "/").removeprefix("./")
     if (exact := labels_of.get(name, labels_of.get(name.rsplit(".", 1)[0]))) is not None:

@@ -103,7 +103,6 @@ def ruzicka_similarity(
 
 
 def _concatenate(first: Samples, second: Samples) -> Samples:
-    """The pixels of both sets of regions in one, those of `first` first."""
     return Samples(
         xy=torch.cat((first.xy.T, second.xy.T), 1).T,
         owner=torch.cat((first.owner, second.owner + first.num_regions)),

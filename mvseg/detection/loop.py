@@ -86,7 +86,6 @@ def match_proposals(
 
 
 def _count_instances(masks: Masks) -> dict[int, int]:
-    """{class: number of its instances}."""
     of_class = {label: masks.instance_ids[masks.classes == label] for label in masks.classes.unique().tolist()}
     return {label: len(ids[ids > 0].unique()) for label, ids in of_class.items()}
 

@@ -187,7 +187,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         min_score: float = 0.0,
         residual_px: int | None = None,
     ) -> Matching:
-        """Match the remaining proposals whose mask is not empty; `labels` are their rows."""
         with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
             proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
             is_asked = (proposals.regions.areas > 0) & (proposals.detection_scores >= min_score)
@@ -211,7 +210,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     def _collect(
         self, detections: list[dict[str, Tensor]], sizes: list[list[int]], *, masks: Masks
     ) -> list[dict[str, Tensor]]:
-        """torchvision's result dicts of the kept proposals, with their ids."""
         results, start = [], 0
         for view, (proposals, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
             here = masks.select(masks.view_index == view)

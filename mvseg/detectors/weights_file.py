@@ -46,7 +46,6 @@ def encode_weights(state: Mapping[str, Tensor], description: Description) -> byt
 
 
 def _sort_metadata(content: bytes) -> bytes:
-    """Sort the metadata of a file: safetensors writes them in a new order each time."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])
     header["__metadata__"] = dict(sorted(header["__metadata__"].items()))

@@ -179,7 +179,6 @@ def find_segments(
 
 
 def _count(labels: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Every label that occurs, and how often."""
     numbers, counts = np.unique(labels, return_counts=True)
     return zip(numbers.tolist(), counts.tolist(), strict=True)
 

@@ -268,7 +268,6 @@ def check_images_once(path: Path, coco: CocoFile, views: Sequence[int | None]) -
 def _decode_all(
     path: Path, annotations: list[tuple[int, CocoAnnotation]], size: list[int], *, has_ids: bool
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The masks of annotations, each with its place in the file; `size` is the width and height of their image."""
     width, height = size
     for place, annotation in annotations:
         with faults_of(f"{path}: annotation {place if annotation.id is None else annotation.id}"):

@@ -53,7 +53,6 @@ def find_turn(data: bytes) -> int:
 
 
 def _linked(links: bytes, item: int) -> set[int]:
-    """The numbers of an item's properties, from the content of a box `ipma`."""
     id_bytes, link_bytes = (4 if links[0] else 2), (2 if links[3] & 1 else 1)
     items, at = set(), 8
     for _ in range(int.from_bytes(links[4:8])):

@@ -148,7 +148,6 @@ def _any_fault() -> Iterator[None]:
 
 
 def _find_reader(start: bytes) -> Callable[[IO[bytes]], ImageFile]:
-    """Pillow's reader for a file with these first bytes."""
     if start[4:8] == b"ftyp" and start[8:12] in BRANDS:
         return open_heic
     for magic, reader in READERS:
@@ -258,7 +257,6 @@ def is_turned(path: Path) -> bool:
 
 
 def _orientation_of(image: ImageFile) -> int:
-    """EXIF orientation of an image that is open, not decoded."""
     if isinstance(image, TiffImageFile):
         tag = image.tag_v2.get(ORIENTATION)
     elif isinstance(image, PngImageFile):  # whose own method decodes it, to find a chunk behind the pixels
@@ -276,7 +274,6 @@ def _orientation_of(image: ImageFile) -> int:
 
 
 def _find_chunk(file: IO[bytes], kind: bytes) -> bytes:
-    """The content of a PNG file's first chunk of a kind; b"" without one."""
     file.seek(len(PNG_START))
     while len(head := file.read(8)) == 8:
         length = int.from_bytes(head[:4])

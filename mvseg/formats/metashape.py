@@ -165,7 +165,6 @@ def _photo(
 
 
 def _read_sensor(sensor: ElementTree.Element) -> tuple[int, int, dict[str, float]]:
-    """Width, height and the numbers of the calibration, the adjusted one if there is one."""
     kind = sensor.get("type", "frame")
     if kind != "frame":
         raise InputError(f"its sensor is of the type {kind}, expected frame")

@@ -158,7 +158,6 @@ def view_names(files: Sequence[str]) -> list[str]:
 
 
 def _problem(photo: Photo, file: str) -> str | None:
-    """Problem of a photo's camera or of the path of its file, as the end of a sentence; None if there is none."""
     problem = file_name_problem(file)
     if problem:
         return problem

@@ -86,20 +86,17 @@ def read_photo_angles(path: Path) -> dict[str, float]:
 
 
 def _read_table(path: Path, what: str) -> Rows:
-    """The rows of a CSV file, as {column: entry}; None where a row has no such cell."""
     (_, columns), *rows = read_table(path, f"a table of {what}") or [(0, [])]
     return [dict(zip_longest(columns, cells[: len(columns)])) for _, cells in rows]
 
 
 def _columns(rows: Rows) -> dict[str, Any]:
-    """{name in small letters: column}; that of the photos is called "photo", whatever its name."""
     keys = {str(key).strip().lower(): key for key in (rows[0] if rows else ())}
     photo = next((keys[name] for name in NAMES if name in keys), None)
     return keys if photo is None else keys | {"photo": photo}
 
 
 def _by_photo(path: Path, rows: Rows, columns: Sequence[Any], *, what: str) -> dict[str, list[float]]:
-    """{photo: numbers}, of the columns of the photo and of its numbers."""
     positions: dict[str, list[float]] = {}
     for index, row in enumerate(rows):
         name = row.get(columns[0])

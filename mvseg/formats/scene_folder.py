@@ -73,7 +73,6 @@ def _read_cameras(folder: Path) -> Scene:
 
 
 def _read_others(folder: Path) -> Scene | None:
-    """The scene of the first kind of cameras but a rig file; None if there is none."""
     model = find_colmap_model(folder)
     if model is not None:
         return read_colmap(model, folder)
@@ -82,7 +81,6 @@ def _read_others(folder: Path) -> Scene | None:
 
 
 def _find_others(folder: Path) -> tuple[str, Path] | None:
-    """The first key of `READERS` that a folder has, and its file."""
     paths = ((name, find_metashape(folder) if name == "*.xml" else folder / name) for name in READERS)
     return next(((name, path) for name, path in paths if path is not None and path.is_file()), None)
 
@@ -95,7 +93,6 @@ def is_scene_folder(folder: Path) -> bool:
 
 
 def _describe(folder: Path) -> str:
-    """Content of a folder without cameras, and advice, as the end of a sentence."""
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*"))]
     photos = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
     if photos:

@@ -115,7 +115,6 @@ def read_transforms(path: Path) -> Scene:
 
 
 def _check_keys(path: Path, transforms: _Transforms) -> None:
-    """Refuse keys that change the meaning of others; warn of unknown ones, once each."""
     unknown: dict[str, str] = {}
     for owner, entry in (("the file", transforms), *((each.file_path, each) for each in transforms.frames)):
         extra = entry.model_extra or {}

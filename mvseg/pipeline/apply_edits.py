@@ -110,6 +110,5 @@ def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[P
 
 
 def _removed_masks(before: Masks, after: Masks) -> Masks:
-    """The detected masks of a table that are not in it any more, after the user's edits."""
     is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
     return before.select(~torch.isin(before.regions.labels, after.regions.labels.cpu()[is_left]))

@@ -121,7 +121,6 @@ def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -
 
 
 def _find_missing(plant: Plant, result: Result) -> Finding | None:
-    """Whether leaves were probably missed, where a detector found them, see `find_missing`."""
     from mvseg.verification.unexplained import find_missing
 
     if not plant.opened.is_chosen or (plant.edits and not len(result.masks)):  # the user says that there is none

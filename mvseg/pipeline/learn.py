@@ -107,7 +107,6 @@ def _count_rounds(plant: Plant) -> int:
 
 
 def _is_smaller(plant: Plant) -> bool:
-    """Whether the views chose a smaller size than the one that the detector begins with, see `choose_size`."""
     detect = plant.opened.config.detect
     _, description = read_weights(weights_path(detect.weights))
     if detect.image_size is not None or description is None:
@@ -133,14 +132,12 @@ def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Pl
 
 
 def _at_size(path: Path, size: int) -> bytes:
-    """The content of a file of learned weights, with the size at which the detector looks best with them."""
     weights, description = read_weights(path)
     assert description is not None, "expected weights with a description, as `_fine_tune` writes them"
     return encode_weights(weights, replace(description, image_size=size))
 
 
 def _fine_tune(plant: Plant, labels: ViewLabels) -> bytes:
-    """The content of a file of weights that have learned the labels, at the size of the look that they come from."""
     detect = plant.opened.config.detect
     _, description = read_weights(weights_path(detect.weights))
     if description is None or len(description.categories) != 1:
@@ -156,7 +153,6 @@ def _device() -> str:
 
 
 def _describe(plant: Plant, labels: ViewLabels) -> str:
-    """All that learned weights depend on."""
     shown = [each.regions for each in (labels.leaves, labels.doubtful)]
     tensors = [plant.boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
     digest = hashlib.sha256(b"".join(each.cpu().numpy().tobytes() for each in tensors))

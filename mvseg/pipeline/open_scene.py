@@ -145,9 +145,7 @@ def _hash_weights(config: RunConfig) -> dict[Path, str]:
     return {path: hash_files(path)} if path.is_file() else {}
 
 
-def _take_views(
-    scene: Scene, most: int | Literal["all"], corrections: Corrections | None, *, once: bool
-) -> Tensor:
+def _take_views(scene: Scene, most: int | Literal["all"], corrections: Corrections | None, *, once: bool) -> Tensor:
     """(S,) int64, ascending: the views that are taken, see `RunConfig.views`. Their names decide between equally good
     choices, so that the order of the views does not matter.
 

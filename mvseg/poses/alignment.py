@@ -84,7 +84,6 @@ def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
 
 
 def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
-    """Umeyama's equations (40) to (42)."""
     from_source, from_target = source - source.mean(0), target - target.mean(0)
     turn, _ = Rotation.align_vectors(from_target, from_source)
     scale = float((from_target * turn.apply(from_source)).sum() / (from_source**2).sum())

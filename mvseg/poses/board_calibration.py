@@ -155,7 +155,6 @@ def _fit(
 
 
 def _board_pose(numbers: np.ndarray, px: Floats, board: BoardConfig, lens: TableCamera) -> pycolmap.Rigid3d:
-    """cam_from_board of one photo."""
     _, turn, shift = cv2.solvePnP(board.corners()[numbers], px - 0.5, opencv_matrix(lens.K), lens.distortion)
     return _rigid(Rotation.from_rotvec(np.ravel(turn)), np.ravel(shift))
 
@@ -227,14 +226,12 @@ def _find_axis(poses: Sequence[pycolmap.Rigid3d]) -> tuple[Floats, Floats, Float
 
 
 def _axes_about(direction: Floats) -> Rotation:
-    """A turn of the z axis into a direction (3,)."""
     side = np.cross(direction, [1.0, 0, 0] if abs(direction[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
     return Rotation.from_matrix(np.column_stack([side, np.cross(direction, side), direction]))
 
 
 def _turn_z(angle_deg: float) -> pycolmap.Rigid3d:
-    """The turn of the table."""
     return _rigid(Rotation.from_euler("z", angle_deg, degrees=True), np.zeros(3))
 
 

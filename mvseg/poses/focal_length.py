@@ -75,9 +75,7 @@ def _covariance(model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
     return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjusting)
 
 
-def adjuster(
-    model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions
-) -> pycolmap.CeresBundleAdjuster:
+def adjuster(model: pycolmap.Reconstruction, options: pycolmap.BundleAdjustmentOptions) -> pycolmap.CeresBundleAdjuster:
     """A bundle adjustment of all photos of a model."""
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():

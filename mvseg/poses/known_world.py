@@ -132,7 +132,6 @@ def marker_sides(corners: dict[Corner, Floats]) -> Floats:
 
 
 def _marker_corners(scene: Scene) -> dict[Corner, Floats]:
-    """The corners of the family of markers that has the most of them in space."""
     found = find_scene_markers(Photos(scene))
     return max((triangulate_points(scene.cameras, seen) for seen in found.values()), key=len)
 
@@ -152,7 +151,6 @@ def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str) -> P
 
 
 def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
-    """The centre of a marker or of a photo's camera, or a spot that photos show."""
     places = PLACE.findall(name)
     if places and "".join(f"{photo}:{x},{y}{more}" for photo, x, y, more in places) == name:
         return _spot(scene, name, [(photo, np.array([float(x), float(y)])) for photo, x, y, _ in places])

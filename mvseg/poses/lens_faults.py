@@ -113,7 +113,6 @@ def _try(model: pycolmap.Reconstruction, lens: Lens, *, is_own: bool = False, is
 
 
 def _with_lenses(model: pycolmap.Reconstruction, lens: Lens, *, is_own: bool) -> pycolmap.Reconstruction:
-    """The same photos and points with other lenses; own ones have the numbers of their photos."""
     other = pycolmap.Reconstruction()
     for number in model.reg_image_ids():
         image = model.images[number]
@@ -121,9 +120,7 @@ def _with_lenses(model: pycolmap.Reconstruction, lens: Lens, *, is_own: bool) ->
         if camera_id not in other.cameras:
             name, params = lens(camera)
             size = {"width": camera.width, "height": camera.height}
-            other.add_camera_with_trivial_rig(
-                pycolmap.Camera(model=name, params=params, camera_id=camera_id, **size)
-            )
+            other.add_camera_with_trivial_rig(pycolmap.Camera(model=name, params=params, camera_id=camera_id, **size))
         pixels = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
         alone = pycolmap.Image(name=image.name, keypoints=pixels, camera_id=camera_id, image_id=number)
         other.add_image_with_trivial_frame(alone, image.cam_from_world())

@@ -139,7 +139,6 @@ def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair]
 
 
 def _map_thoroughly(task: _Task, pairs: Sequence[Pair]) -> list[pycolmap.Reconstruction]:
-    """Models from all features that COLMAP finds."""
     database, images = task.work / "thorough.db", task.work / PHOTOS
     make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
     extract_features(database, images, task.photo_of, config=task.config, lens=task.lens)
@@ -149,7 +148,6 @@ def _map_thoroughly(task: _Task, pairs: Sequence[Pair]) -> list[pycolmap.Reconst
 
 
 def _sorted(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
-    """Sort by size, the largest first; equal ones stay in their order."""
     return sorted(models, key=lambda model: -model.num_reg_images())
 
 
@@ -175,7 +173,6 @@ def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.Increment
 
 
 def _map(task: _Task, database: Path, *, few_matches: bool) -> list[pycolmap.Reconstruction]:
-    """All models, each in a frame of its own, the largest first."""
     num_photos = len(task.photo_of)
     with progress_bar(total=num_photos, name="mapping", unit="photo") as bar:
 
@@ -201,7 +198,6 @@ def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile])
 
 
 def _too_few(count: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
-    """The sentence for too few registered photos."""
     poor = f"; {len(plain)} have hardly any texture, the first is {plain[0]}" if plain else ""
     asked = "--min_registered asks for" if given else "expected at least"
     less = "" if given or count < STRUCTURE.least else f", or --min_registered {count} to accept these"
@@ -210,7 +206,6 @@ def _too_few(count: int, num_photos: int, least: int, *, plain: Sequence[str], g
 
 
 def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolmap.Camera:
-    """The calibrated camera of all photos."""
     size = calibrated_size(calibration, photos)
     if calibration.is_fisheye:
         raise InputError("the calibration is of a fisheye, expected one with k1, k2, p1, p2 (, k3)")

@@ -54,7 +54,6 @@ def pairs_with(some: Iterable[int], num_photos: int) -> list[Pair]:
 
 
 def _steps(num_photos: int) -> list[int]:
-    """Distances to the neighbours of a photo in a sequence."""
     steps = list(range(STRUCTURE.overlap + 1))
     while steps[-1] * STRUCTURE.far <= num_photos // 2:
         steps.append(steps[-1] * STRUCTURE.far)

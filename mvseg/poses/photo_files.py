@@ -159,13 +159,10 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     else:
         shutil.copyfile(source, path)
     name = path.relative_to(images).as_posix()
-    return PhotoFile(
-        name=name, width=image.width, height=image.height, optics=optics, is_turned=turned, zoom=zoom
-    )
+    return PhotoFile(name=name, width=image.width, height=image.height, optics=optics, is_turned=turned, zoom=zoom)
 
 
 def _describe_optics(image: Image.Image) -> tuple[str, float]:
-    """`PhotoFile.optics` and `PhotoFile.zoom`."""
     try:
         exif = image.getexif()
         block = exif.get_ifd(EXIF_BLOCK)

@@ -145,7 +145,6 @@ def fit_table(
 
 
 def _camera_numbers(camera: TableCamera) -> Floats:
-    """(13,) of its lens and its pose."""
     (width, height), longer, K = camera.size, max(camera.size), camera.K
     lens = [K[0, 0] / longer, (K[0, 2] - width / 2) / longer, (K[1, 2] - height / 2) / longer, *camera.distortion[:4]]
     return np.concatenate([lens, Rotation.from_matrix(camera.R).as_rotvec(), camera.t])

@@ -191,7 +191,6 @@ def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
 
 
 def _flow(before: Grey, after: Grey, corners: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Positions of corners (C, 1, 2) in the other picture, and (C,) whether they were found."""
     moved, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(VIDEO.window, VIDEO.window), maxLevel=VIDEO.levels
     )

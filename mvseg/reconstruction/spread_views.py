@@ -56,7 +56,6 @@ def spread_directions(ways: NDArray[np.float64], most: int) -> NDArray[np.int64]
 
 
 def _directions(cameras: Cameras) -> NDArray[np.float64]:
-    """(V, 3) unit vectors from what the cameras look at to each of them."""
     axes, centers = cameras.R[:, 2], cameras.centers
     mean_axis, middle = axes.mean(0), centers.mean(0)
     if 1 - mean_axis @ mean_axis < RAYS.parallel**2:
@@ -92,6 +91,5 @@ def _exchange(crowding: NDArray[np.float64], is_taken: NDArray[np.bool_]) -> NDA
 
 
 def _first_least(values: NDArray[np.float64]) -> int:
-    """The index of the least value, or of the first that is nearly as small."""
     least = values.min()
     return int(np.flatnonzero(values <= least + RAYS.tie * abs(least))[0])

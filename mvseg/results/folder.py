@@ -144,7 +144,6 @@ def _write_images(result: Result, folder: Path) -> list[Picture]:
 
 
 def _write_instances(result: Result, folder: Path) -> None:
-    """instances.json: every region, in the frame of the photo the user took."""
     scene, images = result.scene, []
     for index, view in enumerate(scene.views):
         width, height = scene.cameras.sizes[index].tolist()
@@ -156,14 +155,12 @@ def _write_instances(result: Result, folder: Path) -> None:
 
 
 def _describe_camera(scene: Scene, view: int) -> dict[str, Any]:
-    """The undistorted camera of a view, and the lens of its photo, if it has one."""
     cameras, lens = scene.cameras, scene.views[view].lens
     said = {"K": cameras.K[view].tolist(), "R": cameras.R[view].tolist(), "t": cameras.t[view].tolist()}
     return said if lens is None else said | {"lens": {"model": lens.model_name, "params": list(lens.params)}}
 
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
-    """The entry of one region in instances.json, without what COCO itself requires."""
     masks, view = result.masks, int(result.masks.view_index[region])
     instance, other = int(masks.instance_ids[region]), int(masks.second_ids[region])
     track = {"track_id": instance} if instance > 0 else {}
@@ -203,11 +200,9 @@ def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
 
 
 def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
-    """(H, W) mask in the undistorted image, of pixels in the box of a region."""
     width, height = result.scene.cameras.sizes[int(result.masks.view_index[region])].tolist()
     return replace(result.regions.placed(region), pixels=part).paste((width, height)).numpy()
 
 
 def _chance_of(result: Result, instance: int) -> float | None:
-    """Probability that an instance is a leaf, where the views chose it."""
     return result.instances.probabilities.get(instance)

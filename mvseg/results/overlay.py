@@ -107,7 +107,6 @@ def _write(numbers: Sequence[_Number], size: tuple[int, int], *, scale: float) -
 
 
 def _print(canvas: np.ndarray, ink: np.ndarray, *, scale: float) -> None:
-    """Black ink with a white edge."""
     # A thicker stroke underneath would not do as an edge: thickness differs between versions of OpenCV.
     edge = 2 * max(1, round(2 * scale)) + 1
     halo = cv2.dilate(ink, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge)))

@@ -290,7 +290,6 @@ def _table_of(content: _Instances, scene: Scene) -> Masks:
 
 
 def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:
-    """The box and the pixels of a mask in the undistorted image."""
     (width, height), lens = scene.cameras.sizes[view].tolist(), scene.views[view].lens
     rle = mask.undistorted or mask.segmentation
     if lens is None or mask.undistorted is not None:

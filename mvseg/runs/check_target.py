@@ -204,7 +204,6 @@ def _cut_view(
 
 
 def _measured(result: Result, shape: Shape, label: int, *, mm: float, printed: float) -> MeasuredShape:
-    """A shape by the instance that most of its masks were matched to."""
     is_shape = result.regions.labels == label
     ids = Counter(result.masks.instance_ids[is_shape & (result.masks.instance_ids > 0)].tolist())
     instance, num_views = ids.most_common(1)[0] if ids else (0, 0)

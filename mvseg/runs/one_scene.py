@@ -90,7 +90,6 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
 
 
 def _plan_stages(config: RunConfig, *, finds: bool) -> tuple[str, ...]:
-    """The stages that always come, see `running`."""
     first = ("load", "detect", "match", "choose") if finds else ("load", "match")
     shapes, traits = (("snap", "surfaces"), ("voxels", "measure")) if config.reconstruct is not None else ((), ())
     return (*first, *shapes, "check", *traits, "write")
@@ -148,7 +147,6 @@ def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[
 
 
 def _describe_options(masks: Path | None, config: RunConfig) -> dict[str, Any]:
-    """The options of the stages that run."""
     options = asdict(config)
     if masks is not None:
         del options["detect"], options["learn"]
@@ -161,7 +159,6 @@ def _describe_options(masks: Path | None, config: RunConfig) -> dict[str, Any]:
 
 
 def _hash_photos(result: Result) -> dict[str, str]:
-    """{path of a photo in their folder: SHA-256}; nothing where there are no photos."""
     views, photos = result.scene.views, result.photos or Photos(result.scene)
     if not photos.exist:
         return {}

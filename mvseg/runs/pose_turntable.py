@@ -140,7 +140,6 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
 
 
 def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) -> list[str]:
-    """The camera of each photo: that of its folder's name, or the only one that there is."""
     if len(cameras) == 1:
         return [cameras[0]] * len(names)
     folders = [name.rpartition("/")[0] for name in names]
@@ -159,7 +158,6 @@ def _angles_of(
     angles: Angles,
     turntable: Path,
 ) -> list[float]:
-    """The angle of each photo, degrees."""
     if isinstance(angles, Path):
         listed = read_photo_angles(angles)
         listed_angles = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]

@@ -131,7 +131,6 @@ def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence
 
 
 def _option(record: RunRecord, name: str) -> Any:
-    """An option of the run; None where it had none of the name."""
     stage, _, own = name.rpartition(".")
     inside = record.config.get(stage) if stage else record.config
     return inside.get(own) if isinstance(inside, dict) else None
@@ -162,7 +161,6 @@ def _list_other_photos(folder: Path, record: RunRecord, scene: Scene) -> list[Fi
 
 
 def _read_config(folder: Path, record: RunRecord) -> RunConfig:
-    """The options of the stages."""
     options = {
         stage: {name: each for name, each in value.items() if f"{stage}.{name}" not in GONE}
         if isinstance(value, dict)

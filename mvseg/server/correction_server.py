@@ -282,7 +282,6 @@ class Corrector(Generic[Kind]):
         self.news.notify_all()
 
     def _notify(self) -> None:
-        """Announce news; the caller holds the lock."""
         self.number += 1
         self.news.notify_all()
 

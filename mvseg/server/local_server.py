@@ -113,7 +113,6 @@ class _Handler(BaseHTTPRequestHandler):
         return place
 
     def _asked(self, name: str) -> str:
-        """Query of the address, after the question mark; "" without one."""
         return parse_qs(urlsplit(self.path).query).get(name, [""])[0]
 
     def _body(self) -> bytes:

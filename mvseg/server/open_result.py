@@ -284,7 +284,6 @@ class OpenResult:
         return plant, noticed
 
     def _fit_before(self, plant: Plant) -> Mapping[int, LeafSurface] | None:
-        """The surfaces before edits, which tell how the masks err."""
         if self._before is None or self._before[0] is not plant:
             with collect_warnings():
                 self._before = plant, shape_leaves(plant).surfaces

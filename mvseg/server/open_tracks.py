@@ -25,8 +25,6 @@ from mvseg.tracking.track import Tracks, track_leaves
 
 @dataclass(frozen=True, eq=False)
 class _TracksPage:
-    """Content of the page: tracks, and the data that follow from them."""
-
     tracks: Tracks
     data: dict[str, Any]
 
@@ -103,7 +101,6 @@ class OpenTracks:
         return OpenTracks(self.folder, self.plant.plant)
 
     def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
-        """Links of the user, and the problem of each edit; "" for none."""
         links, problems = find_plant_links(corrections.edits, self.dates)
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
@@ -117,7 +114,6 @@ class OpenTracks:
         return track_leaves(self.dates, links=links, pots=self.recorded.pots, plant=self.plant.plant)
 
     def _changes(self, question: Question, links: Sequence[LeafLink]) -> list[str]:
-        """Differences of the tracks if they are wrong there."""
         with suppress(InputError):  # it contradicts what was said before
             other = question.link(self._page.tracks, is_same=not question.is_linked)
             return describe_changes(self._page.tracks, self._track_with([*links, other]))
@@ -140,6 +136,5 @@ def _describe_question(question: Question) -> dict[str, Any]:
 
 
 def _without_pictures(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Data of the page that may have changed: pictures of leaves stay."""
     leaves = [{k: v for k, v in leaf.items() if k not in ("crop", "place")} for leaf in data["leaves"]]
     return {**data, "leaves": leaves}

@@ -124,7 +124,6 @@ class SavedEdits:
                 self.write()
 
     def _find_stamp(self) -> tuple[int, int] | None:
-        """Stamp that changes when the file does; None without a file."""
         try:
             about = self.path.stat()
         except OSError:

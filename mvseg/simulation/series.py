@@ -186,7 +186,6 @@ def plan_plant(spec: SeriesSpec) -> GrowingPlant:
 def _seat_fronds(
     spec: SeriesSpec, counts: Sequence[int], shoots: Sequence[tuple[StemNode, Floats, float]], rng: np.random.Generator
 ) -> list[_Seat]:
-    """Fronds from the oldest to the youngest; shoots take turns, level by level."""
     family = FAMILIES[spec.family]
     span = spec.times[-1] - spec.times[0]
     turns = [rng.uniform(0, 2 * np.pi) for _ in shoots]
@@ -226,7 +225,6 @@ def _uncrowd(plant: GrowingPlant) -> GrowingPlant:
 
 
 def _size(age: float) -> float:
-    """Share of its full length that a leaf has `age` days after its first sight: logistic, up to 1."""
     middle, steep = 0.45 * EXPANSION, 0.11 * EXPANSION
     return FIRST_SIZE + (1 - FIRST_SIZE) / (1 + math.exp(-np.clip((age - middle) / steep, -50, 50)))
 

@@ -233,7 +233,6 @@ def _move_files(names: Collection[str], source: Path, target: Path) -> None:
 
 
 def _sync_files(folder: Path) -> None:
-    """Let all files of a folder reach the disk."""
     for path in (*folder.rglob("*"), folder):
         if path.is_dir():
             _sync_folder(path)
@@ -311,7 +310,6 @@ def _settle(place: Path) -> None:
 
 
 def _delete(path: Path) -> None:
-    """Delete a file or folder, if it exists."""
     if not os.path.lexists(path):
         return
     if path.is_dir() and not path.is_symlink():

@@ -201,8 +201,6 @@ class _Part:
 
 
 class _Lines(tqdm):  # type: ignore[misc]  # it has no types
-    """A bar as lines."""
-
     said_at = math.inf
 
     def __init__(self, *what: Any, **how: Any) -> None:

@@ -138,7 +138,6 @@ def _end_with(parent: Connection) -> None:
 
 
 def _answer(pickled: bytes) -> tuple[Any, list[Warning]]:
-    """In a worker: what `work` returns for the item, and its warnings."""
     work, item = pickle.loads(pickled)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -153,7 +153,6 @@ def pose_gain(pair: Pair, pose: Floats) -> float:
 
 
 def _as_it_stood(pair: Pair) -> Alignment:
-    """The frames agree."""
     costs = fitted_costs(pair)
     pairs = best_pairs(costs)
     return Alignment(np.eye(4), pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))

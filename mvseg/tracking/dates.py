@@ -178,7 +178,6 @@ def read_time(time: str | float) -> float:
 
 
 def _read_moment(text: str) -> float | datetime.datetime:
-    """A number of days, or a date."""
     if NUMBER.fullmatch(text) and abs(float(text)) < OBSERVATIONS.most_days:
         return float(text)
     with suppress(ValueError):
@@ -246,7 +245,6 @@ def _of_one_name(dates: Sequence[PlantOnDate]) -> dict[str, list[int]]:
 
 
 def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
-    """The date with all lengths in the unit of the first."""
     if date.unit == first.unit:
         return date
     if date.unit not in UNITS or first.unit not in UNITS:

@@ -101,7 +101,6 @@ def measure_growth(tracks: Tracks) -> Growth:
 def _points(
     tracks: Tracks, track: int, trait: str, by_date: Mapping[int, Number], *, origins: Mapping[int, Hashable]
 ) -> Iterator[GrowthPoint]:
-    """One trait of one leaf, with its rates; `origins`: of each date."""
     dates, is_told = list(by_date), len(by_date) > 2
     times = np.array([tracks.dates[date].time for date in dates])
     values, sds = (np.array([getattr(number, name) for number in by_date.values()]) for name in ("value", "sd"))
@@ -189,7 +188,6 @@ def _plant_rows(tracks: Tracks, points: Sequence[GrowthPoint]) -> Iterator[Plant
 
 
 def _relative_growth(before: Mapping[int, Number], now: Mapping[int, Number], days: float) -> Number:
-    """Relative growth rate of the tracks that are measured on both dates."""
     both = before.keys() & now.keys()
     if not both:
         return NOTHING

@@ -124,7 +124,6 @@ def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
 
 
 def _describe_plant(growth: Growth) -> dict[str, Any]:
-    """See `_describe_growth`."""
     rows = [
         {"total area": row.total_area, "relative growth rate": row.relative_growth_rate,
          "leaves": Number(row.leaves, 0.0, ""), "leaves that appeared": Number(row.born, 0.0, ""),
@@ -142,7 +141,6 @@ def _describe_plant(growth: Growth) -> dict[str, Any]:
 
 
 def _round(value: float, digits: int) -> float | None:
-    """Round to so many significant digits; None for numbers that are not finite, which JSON lacks."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 

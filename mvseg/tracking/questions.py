@@ -59,7 +59,6 @@ def _of_links(tracks: Tracks) -> Iterator[Question]:
 
 
 def _of_ends(tracks: Tracks) -> Iterator[Question]:
-    """Questions about leaves that are gone and leaves that appear afterwards."""
     shaped = [{date.leaves[place].leaf: row for row, place in enumerate(date.shaped)} for date in tracks.dates]
     observations = list(_observations(tracks).values())
     for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in observations for two in observations):
@@ -109,6 +108,5 @@ def _observations(tracks: Tracks) -> dict[int, list[tuple[Observation, float]]]:
 
 
 def _earlier_observations(tracks: Tracks) -> dict[Observation, Observation]:
-    """{observation: the one before it in its track}."""
     every = (pairwise(observations) for observations in _observations(tracks).values())
     return {after: before for pairs in every for (before, _), (after, _) in pairs}

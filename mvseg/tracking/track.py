@@ -190,7 +190,6 @@ def _observations_of(
 
 
 def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.ndarray) -> tuple[TrackRow, ...]:
-    """All tracks, by date; leaves without a shape are tracks of one date."""
     place_of = {(n, row): (n, place) for n, date in enumerate(dates) for row, place in enumerate(date.shaped)}
     after = {place_of[link.before]: (place_of[link.after], link.probability) for link in links}
     later = {at for at, _ in after.values()}

@@ -92,7 +92,6 @@ def join_processes(device: str) -> Iterator[Processes]:
 
 
 def _read_number(key: str) -> int:
-    """One of the numbers that torchrun gives its processes; 0 without torchrun."""
     value = os.environ.get(key, "0")
     if not (value.isascii() and value.isdigit() and len(value) < 10):
         raise InputError(f"the environment variable {key} is '{value[:20]}', expected a number as torchrun sets it")

@@ -113,6 +113,5 @@ def are_labels(masks: Masks, probabilities: Mapping[int, float]) -> Tensor:
 
 
 def _scale(mask: Tensor, size: tuple[int, int]) -> NDArray[np.bool_]:
-    """A mask (h, w) bool at another size (height, width)."""
     scaled = functional.interpolate(mask[None, None].byte(), size, mode="nearest-exact")
     return scaled[0, 0].bool().numpy()

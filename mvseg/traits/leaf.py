@@ -136,7 +136,6 @@ _HALVES = np.stack([patch_basis(MIDDLE, np.full(len(MIDDLE), v)).mean(0) for v i
 
 
 def _base_height(coefficients: Floats, frame: Floats | None) -> Floats:
-    """(...) of leaves (..., 26, 3); NaN where up is not known."""
     base = _ENDS[0] @ coefficients
     return np.full(base.shape[:-1], np.nan) if frame is None else base @ frame[2]
 

@@ -192,7 +192,6 @@ def _reference(tangents: Floats, frame: Floats | None) -> Floats:
 
 
 def _apart(first: float, second: float) -> float:
-    """Degrees between two azimuths, in [0, 180]."""
     return float(abs((first - second + 180) % 360 - 180))
 
 
@@ -230,13 +229,11 @@ def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:
 
 
 def _log_normal(degrees: Floats, sd: Floats) -> Floats:
-    """Logarithms of the normal density of differences of azimuths, in degrees."""
     apart = (degrees + 180) % 360 - 180
     return np.asarray(-0.5 * (apart / sd) ** 2 - np.log(sd * np.sqrt(2 * np.pi)))
 
 
 def _log_mean(logs: Floats) -> float:
-    """Logarithm of the mean of numbers with these logarithms."""
     return float(np.logaddexp.reduce(logs) - np.log(len(logs)))
 
 

@@ -61,7 +61,6 @@ def measure_whole(
 def _measure_surfaces(
     surfaces: Mapping[int, LeafSurface], frame: Floats | None, *, num_leaves: int
 ) -> dict[str, Measurement]:
-    """The traits of all these surfaces."""
     numbers: dict[str, Measurement] = {}
     measure = partial(measure_together, up=None if frame is None else frame[2])
     coefficients = torch.stack([surface.coefficients for surface in surfaces.values()])

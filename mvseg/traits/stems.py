@@ -136,7 +136,6 @@ def up_of_stem(stems: Sequence[Stem], surfaces: Mapping[int, LeafSurface], camer
 
 
 def _rises(tube: Tube, up: Floats) -> bool:
-    """Does a stem rise more than it runs aside?"""
     first, last = tube.points()[[0, -1]]
     return bool(2 * ((last - first) @ up) ** 2 > ((last - first) ** 2).sum() and (last - first) @ up > 0)
 
@@ -273,7 +272,6 @@ def _of_tubes(
 
 
 def _is_reversed(tube: Tube, upward: Floats | None, leaves: LeafBases) -> bool:
-    """Does a tube lead downwards, or, where up is not known, away from most leaves?"""
     first, last = tube.points()[[0, -1]]
     if upward is not None:
         return bool((last - first) @ upward < 0)
@@ -282,7 +280,6 @@ def _is_reversed(tube: Tube, upward: Floats | None, leaves: LeafBases) -> bool:
 
 
 def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None, *, tells_up: bool = False) -> tuple[Stem, ...]:
-    """The stems of axes; a leaf sits on one of them."""
     source = "leaf bases"
     return tuple(
         measure_stem(

@@ -177,7 +177,6 @@ def choose(
 def _accept(
     candidates: Candidates, q: Floats, steps: Sequence[Step], statements: Statements, min_probability: float | None
 ) -> _Ranked:
-    """Accept candidates as leaves: those that are likely enough and have enough masks, and those that edits hold."""
     least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
     is_taken = candidates.is_certain.copy()
     for each in steps:

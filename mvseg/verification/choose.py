@@ -237,7 +237,6 @@ def gather_candidates(
 def _stem_chances(
     surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
 ) -> Floats:
-    """(K,) probability that each candidate is a stem; `members` are its rows of R' regions."""
     ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
     tubes = tube_evidence(
         regions.select(torch.cat(list(members))),
@@ -253,7 +252,6 @@ def _stem_chances(
 
 
 def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
-    """Whether the masks of one of the candidates are nearly these, by area."""
     for others in members:
         common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
         if common > CHOICE.same * either:

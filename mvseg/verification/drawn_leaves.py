@@ -86,7 +86,6 @@ def follow_drawn(
 
 
 def _is_followed(masks: Masks, leaf: int) -> bool:
-    """Whether a leaf has masks in several views, and none, or others than the user's, in others."""
     is_own = masks.instance_ids == leaf
     return bool(_views_without(masks, leaf)) or bool((is_own & ~masks.is_corrected & ~masks.is_linked).any())
 
@@ -173,7 +172,6 @@ def _fit(
 
 
 def _find_parts(remaining: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
-    """{view: largest remaining part around the leaf's place}."""
     parts = {}
     for view in remaining:
         place = Crop.of(remaining[view] & around[view]) if (remaining[view] & around[view]).any() else None
@@ -184,7 +182,6 @@ def _find_parts(remaining: Mapping[int, Frame], around: Mapping[int, Frame]) -> 
 
 
 def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:
-    """Add the masks that the other views show of a leaf."""
     ids, parts = masks.instance_ids.clone(), {}
     for view, (visible, leaf_colored) in _find_open(masks, leaf, surface, cameras=cameras, colored=colored).items():
         is_free = (ids < 0) & ~masks.is_corrected & ~masks.is_linked  # a linked one does not show the leaf
@@ -275,7 +272,6 @@ def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Fram
 
 
 def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame]) -> dict[int, Frame]:
-    """{view: (H, W) bool} where a surface is, and around it."""
     around = {}
     for view, part in enumerate(surface.project_parts(cameras)):
         if view in frames:
@@ -286,7 +282,6 @@ def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame])
 
 
 def _largest_part(frame: Frame) -> Frame:
-    """Largest connected part of a mask, without parts thinner than three pixels."""
     opened = cv2.morphologyEx(frame.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     if count < 2:

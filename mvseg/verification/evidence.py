@@ -104,7 +104,6 @@ def draw_views(
 
 
 def _depths(surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> Floats:
-    """(V, K) of the middles of surfaces, world units; infinite without one."""
     depths = np.full((len(cameras), len(surfaces)), np.inf)
     for index, each in enumerate(surfaces):
         if each is not None:
@@ -155,7 +154,6 @@ def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
 
 
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
-    """(P, K) the parts without what nearer ones of `hides` cover."""
     parts, taken = drawn.parts, np.zeros(drawn.parts.shape[0], bool)
     pixels = np.ones(parts.nnz, np.int32)
     for index in np.argsort(drawn.depth, kind="stable").tolist():

@@ -64,7 +64,6 @@ def has_leaf_color(photo: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
 
 def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """(bins, bins, bins) int64 of the pixels in a part (H, W) bool; exact up to 16 million of one colour."""
     pixels, mask = photo.reshape(-1, 1, 3), part.reshape(-1, 1).astype(np.uint8)
     counted = cv2.calcHist([pixels], CHANNELS, mask, (COLORS.bins,) * 3, RANGES)
     return counted.astype(np.int64)

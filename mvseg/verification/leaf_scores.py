@@ -106,9 +106,7 @@ class ClearLeaves:
     length: float
 
 
-def show_chances(
-    candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED
-) -> Floats:
+def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
     masks that were matched to a candidate can; what the user says is certain."""
     q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))

@@ -63,7 +63,6 @@ def _comes_of_one(ids: Tensor, leaf: Ints) -> Tensor:
 
 
 def _links(leaf: Ints, is_free: Bools) -> Links:
-    """Links that hold the other masks together and keep instances apart."""
     must: list[tuple[int, int]] = []
     cannot: list[tuple[int, int]] = []
     firsts: list[int] = []

@@ -141,7 +141,6 @@ def _labels(numbers: np.ndarray) -> np.ndarray:
 
 
 def _stack(masks: np.ndarray) -> np.ndarray:
-    """(N, H, W) bool."""
     if masks.ndim == 4 and masks.shape[1] == 1:
         masks = masks[:, 0]
     if masks.ndim != 3 and masks.size:

@@ -74,7 +74,6 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
 
 @np.errstate(over="ignore", invalid="ignore")  # absurd corners become infinite, which the codec refuses
 def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
-    """(height, width) bool; None for a shape without area."""
     kind = shape.shape_type or "polygon"
     if kind in ("line", "linestrip", "point", "points") or shape.label in NO_MASKS:
         return None

@@ -53,7 +53,6 @@ def has_labels(array: np.ndarray) -> bool:
 
 
 def _mask_of(path: Path, numbers: np.ndarray) -> np.ndarray:
-    """(H, W) bool of one mask of a stack."""
     if numbers.dtype.kind == "f" and not (np.isfinite(numbers) & (numbers == np.floor(numbers))).all():
         raise InputError(f"{path}: holds a stack of fractions, expected masks of 0 and 1: save masks > 0.5")
     if numbers.dtype.kind in "if" and (numbers < 0).any():

@@ -78,7 +78,6 @@ def stack_views(
 
 
 def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
-    """The masks of a label map, by their numbers."""
     label_map = undistort(labels, lens, K)
     boxes = label_boxes(label_map)
     for number in sorted(boxes if lens is None else label_boxes(labels)):
@@ -89,7 +88,6 @@ def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray
 def _crop_masks(
     masks: Iterable[tuple[int, np.ndarray]], lens: pycolmap.Camera | None, K: np.ndarray
 ) -> Iterator[Cropped]:
-    """The masks with their numbers, one in memory at a time."""
     for label, mask in masks:
         shown = undistort(mask.view(np.uint8), lens, K).view(bool)
         x1, y1, x2, y2 = box = mask_box(torch.from_numpy(shown)) if shown.any() else (0, 0, 0, 0)
@@ -97,7 +95,6 @@ def _crop_masks(
 
 
 def _without_copies(regions: Regions, *, source: object) -> Regions:
-    """Drop regions that nearly equal an earlier one of their view."""
     is_copy, areas = torch.zeros(len(regions), dtype=torch.bool), regions.areas.tolist()
     for one, other, shared in regions.overlaps():
         if not is_copy[one] and shared >= SAME * (areas[one] + areas[other] - shared):

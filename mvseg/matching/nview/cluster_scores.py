@@ -161,7 +161,6 @@ class ClusterScores:
         return GAINS.pair_factor(self.sweep.num_views)
 
     def _members_elsewhere(self, view: int, numbers: Ints) -> list[Ints]:
-        """The members of clusters 0 .. K - 1 in other views."""
         elsewhere = np.where(self.sweep.view_index == view, -1, numbers)
         return members_of(elsewhere, int(numbers.max(initial=-1)) + 1)
 
@@ -172,7 +171,6 @@ class ClusterScores:
         return np.stack(found, 1) if found else np.zeros((here.stop - here.start, 0), np.float32)
 
     def _score_clusters(self, view: int, members: list[Ints]) -> Floats:
-        """(C, N) float32: the scores of the view's regions in C clusters."""
         regions, pixels = self.sweep.bounds.regions(view), self.sweep.bounds.pixels(view)
         owner = self.sweep.pixel_region[pixels] - regions.start
         start = run_starts(owner)
@@ -219,14 +217,12 @@ class ClusterScores:
         return np.float32(COSTS.hidden) + np.float32(COSTS.absent - COSTS.hidden) * share
 
     def _has_region(self, members: list[Ints]) -> NDArray[np.bool_]:
-        """(C, V): in which views clusters have a region."""
         has_region = np.zeros((len(members), self.sweep.num_views), bool)
         for number, regions in enumerate(members):
             has_region[number, self.sweep.view_index[regions]] = True
         return has_region
 
     def _cover(self, clusters: Clusters, asked: Ints) -> Floats:
-        """(C, D) float32: the coverages of the C clusters in `asked`."""
         sweep, num_regions, num_views = self.sweep, len(clusters.ids), self.sweep.num_views
         index_of = np.full(len(clusters), -1)
         index_of[asked] = np.arange(len(asked))

@@ -86,7 +86,6 @@ def collect_evidence(scores: ClusterScores, clusters: Clusters, pairwise: Cluste
 
 
 def _count_partners(clusters: Ints, view_index: Ints) -> tuple[Ints, Ints]:
-    """(D,) members of each region's cluster in other views; and in its own view, itself included."""
     place = clusters * (int(view_index.max(initial=0)) + 1) + view_index
     num_fragments = np.bincount(place)[place]
     return np.bincount(clusters)[clusters] - num_fragments, num_fragments

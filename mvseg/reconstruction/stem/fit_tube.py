@@ -94,8 +94,6 @@ def believe_offsets(measured: Floats, sd_px: float) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Coefficients on the way: axis (6, 3) and radii (3,)."""
-
     axis: Floats
     radii: Floats
 
@@ -275,7 +273,6 @@ def apparent_widths(masks: MaskStack, axis: Floats) -> tuple[Floats, Floats]:
 
 
 def _weigh(distances: TubeDistances, scale_px: float) -> Floats:
-    """(N,) robust weights."""
     spread = float(np.median(np.abs(distances.px))) if len(distances.px) else 0.0
     scale = max(scale_px, TUBE.scale_factor * spread)
     return np.asarray(TUBE.sample_weight * distances.weight / (1 + (distances.px / scale) ** 2))

@@ -50,7 +50,6 @@ def find_starts(stacks: Sequence[MaskStack], *, is_rough: bool) -> list[tuple[Ma
 
 
 def _carve(masks: MaskStack) -> tuple[MaskStack, Hull]:
-    """The masks that are right, and their hull."""
     hull = carve_hull(masks)
     seen = hull.points[hull.is_seen] if hull.is_seen.any() else hull.points
     if len(seen):

@@ -206,7 +206,6 @@ def _centre(measured: Floats, errors: MaskErrors | None) -> float:
 
 
 def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
-    """Standard deviation of `_centre`, pixels."""
     known = measured[np.isfinite(measured)]
     if not len(known):
         return 0.0
@@ -254,7 +253,6 @@ def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[fl
 
 
 def _rms_per_view(equations: _Equations, num_views: int) -> Floats:
-    """(S,) NaN for a view without samples."""
     distances = equations.distances
     squares = np.bincount(distances.stack, equations.weight * distances.px**2, num_views)
     with np.errstate(invalid="ignore"):

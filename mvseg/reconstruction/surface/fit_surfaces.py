@@ -254,7 +254,6 @@ def stack_instance(members: Regions, cameras: Cameras, frames: list[np.ndarray],
 
 
 def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
-    """Fit leaves to their own rims, given all leaves and the errors of the masks."""
     surfaces = []
     for each in asked:
         first, coefficients = each.approach, each.approach.coefficients.numpy()
@@ -268,7 +267,6 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
-    """Surface of a fit; `offsets` (S,) are those of the first fit."""
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "shape_unknown", "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)
@@ -315,7 +313,6 @@ def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
 
 
 def _judge(surface: LeafSurface) -> dict[str, str]:
-    """The reasons to doubt a fit."""
     reasons = {}
     if not surface.is_credible:
         reasons["no_blade"] = "no leaf, or its masks contradict each other: no single blade explains them"

@@ -241,7 +241,6 @@ def choose_pixel_size(num_pixels: Sequence[int], longest: int) -> int:
 
 
 def _cut(frame: NDArray, corner: tuple[int, int], size: tuple[int, int], *, beyond: int) -> NDArray:
-    """(rows, columns) of a frame from a corner on; `beyond` outside of it."""
     crop = np.full((size[1], size[0]), beyond, frame.dtype)
     x1, y1 = max(corner[0], 0), max(corner[1], 0)
     x2, y2 = min(corner[0] + size[0], frame.shape[1]), min(corner[1] + size[1], frame.shape[0])

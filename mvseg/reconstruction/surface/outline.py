@@ -249,7 +249,6 @@ def outline_distances(
 
 
 def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) -> Floats:
-    """(N, 3) derivative of normal . px by the world position."""
     rows = px_from_world[:, :2, :3] - samples.px[:, :, None] * px_from_world[:, 2:, :3]
     across: Floats = normals[:, :1] * rows[:, 0] + normals[:, 1:] * rows[:, 1]
     return across / samples.depth[:, None]

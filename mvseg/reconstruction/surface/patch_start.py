@@ -94,7 +94,6 @@ def _geodesic_places(points: Floats) -> Floats:
 
 
 def _first_largest(values: Floats) -> int:
-    """Place of the first of the largest values (P,)."""
     return int((values >= values.max() * (1 - STARTS.tie)).argmax())
 
 

@@ -147,7 +147,6 @@ def _describe_part(part: StemPart, frame: Frame) -> dict[str, Any]:
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:
-    """A mesh as little-endian numbers of 16 bits in base64."""
     steps = np.round(np.clip(points, -1, 1) * STEPS).astype("<i2")
     return {
         "points": base64.b64encode(steps.tobytes()).decode("ascii"),
