@@ -28,7 +28,8 @@ class RunConfig:
             where the detector does not know the species: most leaves score less than it is sure of, or the views choose
             a smaller size than its own.
         views: take so many views, evenly spread by direction around what the cameras look at; "all" for all; None for
-            all where masks are given, and `ENOUGH_VIEWS` otherwise. Views that corrections name are taken besides.
+            all where masks are given, and `ENOUGH_VIEWS` otherwise; of views from one place only the first, unless
+            "all" is said of given masks. Views that corrections name are taken besides.
         scale: factor of all lengths of the world; None for 1. Cameras that state their unit need `unit` with it.
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held

@@ -471,8 +471,8 @@ def test_two_cameras_that_share_a_centre(
     edit_rig(plant, 1, R=same["R"], t=same["t"])
     for kind in ("images", "masks"):
         shutil.copy(plant / kind / "000.png", plant / kind / "001.png")
-    coarse = COARSE if verb == "infer" else []
-    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *coarse]) == 0
+    words = [*COARSE, "--views", "all"] if verb == "infer" else []
+    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *words]) == 0
     (run,) = (tmp_path / "out").rglob("run.json")
     findings = json.loads(run.read_text())["findings"]
     shared = next(each for each in findings if each["code"] == "same_position")

@@ -52,7 +52,7 @@ def rejects(*views: str) -> Corrections:
 
 
 def test_views_of_one_place_count_once(plant: Path, tmp_path: Path) -> None:
-    """Of a burst, or of a film with equal frames; given masks keep their ids in all views."""
+    """Of a burst, or of a film with equal frames."""
     twice = tmp_path / "twice"
     shutil.copytree(plant, twice)
     rig = json.loads((twice / "cameras.json").read_text())
@@ -60,13 +60,18 @@ def test_views_of_one_place_count_once(plant: Path, tmp_path: Path) -> None:
         copy = view["file"].replace("images/", "images/again-")
         shutil.copy(twice / view["file"], twice / copy)
         rig["views"].append(view | {"file": copy})
+        mask = twice / "masks" / f"{Path(view['file']).stem}.png"
+        shutil.copy(mask, mask.with_name(f"again-{mask.name}"))
     (twice / "cameras.json").write_text(json.dumps(rig))
     with warns_of("views_repeated"):
         opened = open_scene(twice, None, replace(IDS_ONLY, views="all"))
     assert [view.name for view in opened.scene.views] == [f"{view:03d}" for view in range(9)]
     assert len(opened.views_left_out) == 9
     assert not find_repeated(opened.scene.cameras).any()
-    assert len(open_scene(plant, plant / "masks", IDS_ONLY).scene.views) == 9
+    with warns_of("views_repeated"):
+        once = run_scene(twice, twice / "masks", IDS_ONLY)
+    assert torch.equal(once.masks.instance_ids, run_scene(plant, plant / "masks", IDS_ONLY).masks.instance_ids)
+    assert len(open_scene(twice, twice / "masks", replace(IDS_ONLY, views="all")).scene.views) == 18
 
 
 def test_it_is_the_run_of_a_scene_without_the_other_views(plant: Path, tmp_path: Path) -> None:
@@ -120,7 +125,7 @@ def test_a_result_says_which_views_it_shows_and_is_made_again_with_them(
     plain = ["--out", str(out), "--quiet", "--report", "false", *SHAPES]
     assert main(["infer", str(plant), "--masks", "masks", "--views", "5", *plain]) == 0
     said = capsys.readouterr()
-    assert "mvseg: 5 of 9 views are taken, evenly spread\n" in said.err
+    assert "mvseg: 5 of 9 views are taken\n" in said.err
     assert "12 of 27 masks are left out" in said.err
     assert "from 15 masks (label images) in 5 views" in said.out
     run = json.loads((out / "run.json").read_text())

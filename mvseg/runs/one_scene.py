@@ -70,7 +70,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
         result, card, is_shown = solved.result, solved.card, now_running().progress
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if request.config.views else "; --views all takes all"
-            say(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", to_stderr=True)
+            say(f"mvseg: {num_taken} of {num_taken + left_out} views are taken{more}", to_stderr=True)
         for finding in result.findings:
             if finding.level != "note" and not (is_shown and finding == card.doubt):
                 say(f"mvseg: warning: {finding}", to_stderr=True)
