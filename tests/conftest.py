@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 import gc
-import hashlib
 import os
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import cv2
-import numpy as np
 import pytest
 import torch
 
 from mvseg import demo
-from mvseg.checks import photo_matches
-from mvseg.checks.photo_matches import PhotoMatches, find_photo_features, match_pair
 from mvseg.cli import command
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.poses.sift import Sift
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from mvseg.system import worker_pool
@@ -52,30 +46,6 @@ def one_worker() -> Iterator[None]:
     """Commands fit surfaces in the process of the test: another one would load all libraries for some leaves."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "default_workers", lambda: 1)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_look() -> Iterator[None]:
-    """Features of equal photos are found once, and matched once, whatever looks at them: checks, and each run."""
-    found: dict[Any, Sift] = {}
-    matched: dict[Any, PhotoMatches] = {}
-
-    def find(photo: np.ndarray) -> Sift:
-        key = photo.shape, hashlib.sha256(photo.tobytes()).digest()
-        if key not in found:
-            found[key] = find_photo_features(photo)
-        return found[key]
-
-    def match(views: tuple[int, int], first: Sift, second: Sift, *, unit_px: float) -> PhotoMatches:
-        key = views, id(first), id(second), unit_px  # `found` keeps them
-        if key not in matched:
-            matched[key] = match_pair(views, first, second, unit_px=unit_px)
-        return matched[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(photo_matches, "find_photo_features", find)
-        patch.setattr(photo_matches, "match_pair", match)
         yield
 
 

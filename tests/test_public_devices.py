@@ -107,7 +107,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "list_mask_questions": (lambda r, c, i: len(list_mask_questions(masks_of(r, i), surfaces(), cameras=c)), False),
     "matching_metrics": (lambda r, c, i: matching_metrics(i, i).ari, False),
     "shape_distance": (lambda r, c, i: shape_distance(c.t, c.t), False),
-    "check_scene": (lambda r, c, i: len(check_scene(scene_there(c), r, features=False).findings), False),
+    "check_scene": (lambda r, c, i: len(check_scene(scene_there(c), r).findings), False),
     "measure_plant": (
         lambda r, c, i: measure_plant(
             scene_there(c), Matching(masks_of(r, i), MatchReport("none")), surfaces=surfaces(), voxels={},

@@ -120,7 +120,6 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
-    """Run all scenes in parallel. Scenes whose worker died run once more, one at a time, when memory is free again."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
     running: dict[int, str] = {}  # in the order in which they began

@@ -61,7 +61,6 @@ def _describe_file(path: Path, start: Path) -> list[str | int]:
 
 
 def _mask_files(masks: Path) -> list[Path]:
-    """The files of masks, and the names of classes that may lie in the folders above."""
     if not masks.is_dir():
         return [masks]
     files = sorted(path for path in masks.rglob("*") if path.is_file() and not path.name.startswith("."))

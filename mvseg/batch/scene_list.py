@@ -125,7 +125,6 @@ def _beside_table(source: Path, path: str | None) -> Path | None:
 
 
 def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Columns, and the rows that are not empty, with the numbers of their lines."""
     rows = read_table(source, "a CSV table")
     if not rows:
         raise InputError(f"{source}: is empty, expected a table with a column 'scene'")

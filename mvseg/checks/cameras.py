@@ -166,7 +166,6 @@ def _mixed_units(cameras: Cameras, coverage: Coverage) -> Rule | None:
 
 
 def _distance_ratio(cameras: Cameras, coverage: Coverage, is_short: Tensor) -> float:
-    """Ratio of the median distances of two groups of cameras from the point; at least 1."""
     distance = torch.linalg.vector_norm(cameras.centers - torch.from_numpy(coverage.point), dim=1)
     short, long = (float(distance[group].median().clamp(min=1e-300)) for group in (is_short, ~is_short))
     return max(short / long, long / short)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
-from mvseg.checks.epipolar_distances import distance_findings, groups_that_fit, list_significant
 from mvseg.checks.groups import group_findings
 from mvseg.checks.masks import detected_findings, mask_findings
-from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
 from mvseg.checks.turned_masks import low_fit_findings
@@ -23,9 +17,6 @@ from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Scene
-
-# What masks that disagree with poses are, where photos show that the poses are right.
-OF_OTHER_PHOTOS = {"view_off": "masks_of_other_photo", "poses_disagree": "masks_of_other_photos"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +50,15 @@ def check_scene(
     regions: Regions | None = None,
     *,
     photos: Photos | None = None,
-    features: bool = True,
     is_detected: bool = False,
 ) -> Check:
-    """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks and the photos.
+    """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks.
 
     No ids are given. Everything runs on the CPU, wherever the inputs are.
 
     Args:
         scene: of V views; photos may be absent.
         photos: of the scene, where somebody has read them; None: they are read.
-        features: compare features of neighbouring photos with the cameras, which takes about 0.1 s per photo.
         is_detected: a detector found the masks in these photos, so they are of no others.
 
     Raises:
@@ -81,7 +70,6 @@ def check_scene(
     coverage = find_coverage(scene.cameras)
     photos = photos or Photos(scene)
     facts = read_photo_facts(photos)
-    matches = match_photos(photos, scene.cameras) if features else []
     findings = camera_findings(scene, coverage) + photo_findings(facts, scene, has_masks=regions is not None)
     agreement = None
     if regions is not None:
@@ -91,11 +79,7 @@ def check_scene(
         if not bool(is_coincident(scene.cameras).all()):
             agreement = pairwise_agreement(regions, scene.cameras)
             findings += low_fit_findings(regions, scene.cameras, agreement, is_detected=is_detected)
-            by_masks = pose_findings(agreement, names) + group_findings(agreement, names)
-            findings += _judge(
-                by_masks, groups_that_fit(list_significant(matches), scene.cameras), is_detected=is_detected
-            )
-    findings += distance_findings(matches, scene.cameras, names)
+            findings += pose_findings(agreement, names) + group_findings(agreement, names)
     return Check(
         scene=scene,
         regions=regions,
@@ -104,17 +88,3 @@ def check_scene(
         photos=tuple(facts),
         agreement=agreement,
     )
-
-
-def _judge(findings: Sequence[Finding], groups: NDArray[np.int64], *, is_detected: bool) -> list[Finding]:
-    """Findings about poses from masks. Views whose photos fit the cameras of most others (`groups_that_fit`) are
-    excepted: their poses are right, so their masks are of another photo, or mistakes of the detector."""
-    sizes = np.bincount(groups)
-    is_sound = (groups == sizes.argmax()) & (sizes.max() > len(groups) / 2)
-    judged = []
-    for each in findings:
-        if not (is_sound[list(each.views)].all() and is_sound.any()):  # about the whole scene: most views are sound
-            judged.append(each)
-        elif each.code in OF_OTHER_PHOTOS and not is_detected:
-            judged.append(replace(each, code=OF_OTHER_PHOTOS[each.code]))
-    return judged

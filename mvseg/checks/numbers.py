@@ -53,31 +53,6 @@ class AgreementNumbers:
 
 
 @dataclass(frozen=True)
-class FeatureNumbers:
-    """Features of photos against cameras."""
-
-    side: int = 800  # limit: pixels of the longer side of photos in which features are found
-    most_features: int = 1500  # limit: max. features of a photo
-    contrast: float = 0.013  # chosen: min. contrast of a feature: leaves have less than OpenCV's default of 0.04
-    best_angle: float = 15.0  # chosen: degrees between two views that are matched: above, fewer features are the same
-    widest_angle: float = 60.0  # chosen: the same, at most
-    partners: int = 4  # chosen: views that a view is matched with: wrong cameras are wrong about what is near, too
-    most_views: int = 24  # limit: max. views of which each is matched with others
-    sources: int = 8  # limit: views that are matched with others where there are more
-    still: float = 3.0  # chosen: units up to which features stand still, as the wall behind a turntable
-    tolerance: float = 1.0  # chosen: units that a feature may miss a fundamental matrix by
-    fewest: int = 20  # chosen: min. features that fit one fundamental matrix; 40 with nothing in common give 13
-    least_share: float = 0.5  # chosen: the same, as a share of all features that have moved
-    offset: float = 1.5  # chosen: units that features of right cameras may miss their epipolar lines by
-    contradicts: float = 0.3  # chosen: share of features on the lines of the cameras, below which these are wrong
-    agrees: float = 0.6  # chosen: the same, above which they agree
-    fewest_pairs: int = 3  # chosen: min. pairs of photos that judge a focal length
-    least_error: float = 0.05  # chosen: min. change of its logarithm
-    better: float = 0.5  # chosen: max. epipolar distance with another focal length, in that with the given one
-    most: float = 0.7  # chosen: min. share of the pairs for which it is better, and in which features fit
-
-
-@dataclass(frozen=True)
 class PhotoNumbers:
     """Masks and photos on their own, and shapes of the target in photos."""
 
@@ -100,5 +75,4 @@ class PhotoNumbers:
 
 CAMERAS = CameraNumbers()
 AGREEMENT = AgreementNumbers()
-FEATURES = FeatureNumbers()
 IMAGES = PhotoNumbers()

@@ -184,7 +184,6 @@ def _hull(regions: Regions, index: int) -> Tensor:
 
 
 def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
-    """Begin and end of each mask that does not hold the epipole, at corners (N, P, 2) of their hulls."""
     plane = pencil.plane_from_px[side]
     x, y = (corners @ plane[:, :2].T + plane[:, 2]).unbind(2)
     angle = torch.atan2(y, x)

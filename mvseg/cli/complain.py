@@ -34,7 +34,6 @@ def complain(error: Exception, arguments: Sequence[str] = (), *, options: Sequen
 
 
 def _suggest(message: str, options: Sequence[str]) -> str:
-    """A sentence about a verb or an option that there is not, with the one that was perhaps meant."""
     if missing := MISSING.match(message):
         needs = missing[2].replace(f"{missing[1]}.", "")
         return f"{missing[1]} needs {needs}: mvseg {missing[1]} --help says more"

@@ -327,7 +327,6 @@ def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
 
 
 def _mask_at(edited: _Edited, place: Place, scene: Scene) -> EditedMask:
-    """The mask at a place: what the user outlined there, or else the smallest one, as it would be drawn on top."""
     here = _masks_at(place, edited.masks, scene)
     if not here:
         name, x, y = place

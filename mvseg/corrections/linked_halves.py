@@ -90,7 +90,6 @@ def _outline_px(surface: LeafSurface) -> float:
 
 
 def _in_one_photo(masks: Masks, is_one: Tensor, is_other: Tensor) -> list[tuple[int, int]]:
-    """The pairs of masks, one of each of two instances, in the same photo."""
     first, second = is_one.nonzero()[:, 0].tolist(), is_other.nonzero()[:, 0].tolist()
     views = masks.view_index.tolist()
     return [(row, other) for row in first for other in second if views[row] == views[other]]

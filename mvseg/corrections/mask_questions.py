@@ -183,7 +183,6 @@ def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> l
 
 
 def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
-    """The rows of the masks of a view of which `taken` (H, W) covers one half at most."""
     free = []
     for row in (masks.view_index == view).nonzero()[:, 0].tolist():
         crop = masks.regions.placed(row)

@@ -186,7 +186,6 @@ def _count(labels: np.ndarray) -> Iterator[tuple[int, int]]:
 def _covered_labels(
     regions: Regions, segments: np.ndarray, view: int, *, labels: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray]]:
-    """The segments that have masks in a view, and the labels of the pixels that these cover together."""
     members = (regions.view_index == view).nonzero()[:, 0].cpu().numpy()
     for segment in np.unique(segments[members]).tolist():
         covered = regions.union(members[segments[members] == segment].tolist())

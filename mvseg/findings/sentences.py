@@ -12,19 +12,16 @@ TOPICS = {code: topic for topic, table in TABLES.items() for code in table}
 UNSURE_IDS = ("views_disagree", "views_odd", "views_sparse", "view_sparse", "rough_masks")
 DISAGREEMENT = (*UNSURE_IDS, "views_odd_detected", "detector_unsure")  # of the views about the masks
 BY_MASKS = ("poses_disagree", "view_off", "lines_miss", "separate_worlds")
-BY_FEATURES = ("features_contradict", "features_off_one", "features_off_group")
-OF_PHOTOS = ("masks_of_other_photo", "masks_of_other_photos", "focal_lengths_wrong", *BY_FEATURES)
 # {cause and its level: what it explains, and is not told beside it}.
 EXPLAINS: dict[tuple[str, str], tuple[str, ...]] = {
     ("one_sided", "warning"): ("leaves_seen_from_one_side", "shape_cut_off"),
     ("no_depth", "warning"): ("leaves_seen_from_one_side", "shape_cut_off", "one_sided"),
     ("same_position", "warning"): ("centres_shared",),
     **{
-        (code, "error"): (*BY_MASKS, "masks_of_other_photo", "masks_of_other_photos", "low_fit", *DISAGREEMENT)
+        (code, "error"): (*BY_MASKS, "low_fit", *DISAGREEMENT)
         for code in ("turned_masks", "letterboxed_masks", "transposed_masks")
     },
-    **{(code, "error"): ("low_fit", *BY_FEATURES, *DISAGREEMENT) for code in BY_MASKS},
-    **{(code, "error"): ("low_fit", *DISAGREEMENT) for code in OF_PHOTOS},
+    **{(code, "error"): ("low_fit", *DISAGREEMENT) for code in BY_MASKS},
     ("no_leaf_left", "warning"): ("no_masks",),
     ("no_leaves", "warning"): ("nothing_detected", "detector_unsure"),
     ("species_unknown", "warning"): ("detector_unsure", "low_fit_detected", "very_many_proposals"),

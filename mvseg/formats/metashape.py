@@ -102,7 +102,6 @@ def _read_chunk(path: Path) -> ElementTree.Element:
 
 
 def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float] | None:
-    """R, T and scale of world_from_chunk: X = scale R x + T; None if the chunk has no scale of its own."""
     components = chunk.findall("components/component")
     used = {camera.get("component_id") for camera in chunk.iterfind(CAMERAS) if camera.find("transform") is not None}
     if len(used) > 1:
@@ -123,7 +122,6 @@ def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray,
 
 
 def _read_pose(camera: ElementTree.Element) -> np.ndarray | None:
-    """(4, 4) chunk_from_cam; None of a camera that is not aligned, or a slave."""
     text = camera.findtext("transform")
     if text is None:
         return None

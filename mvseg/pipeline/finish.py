@@ -29,15 +29,9 @@ REFUSED = ("broken_photo", "photo_size", "photo_turned")  # by the first stage t
 
 def check_result(result: Result, plant: Plant) -> Result:
     """Add the findings, and warn (InputWarning) of them."""
-    opened, shapes = plant.opened, plant.opened.config.reconstruct
+    opened = plant.opened
     with timed("check"):
-        check = check_scene(
-            result.scene,
-            result.regions,
-            photos=opened.photos,
-            features=shapes is not None and opened.photos.exist,
-            is_detected=opened.given is None,
-        )
+        check = check_scene(result.scene, result.regions, photos=opened.photos, is_detected=opened.given is None)
     doubtful = _find_doubtful(result, has_stems=plant.opened.config.stem_category is not None)
     noticed = *check.findings, plant.disagreement, _find_missing(plant, result), doubtful
     findings = keep_causes(each for each in noticed if each is not None and each.code not in REFUSED)

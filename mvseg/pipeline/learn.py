@@ -116,7 +116,6 @@ def _is_smaller(plant: Plant) -> bool:
 
 
 def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Plant:
-    """The scene, seen with the weights that the run began with once they have learned these labels."""
     opened = plant.opened
     path = cache.learned(_describe(plant, labels))
     if not path.is_file():

@@ -138,7 +138,6 @@ def _agreement(residuals: Floats) -> float:
 
 
 def _most_agreed(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, float]:
-    """The similarity of three points on which just over half of all points agree best, and their agreement."""
     rng = np.random.default_rng(0)
     triples = [rng.choice(len(source), 3, replace=False) for _ in range(WORLD.trials)]
     triples = [three for three in triples if not (is_one_line(source[three]) or is_one_line(target[three]))]

@@ -61,7 +61,6 @@ def _steps(num_photos: int) -> list[int]:
 
 
 def _most_alike(alike: NDArray[np.int64], chosen: set[Pair]) -> set[Pair]:
-    """The photos that are most alike for each photo, not counting known pairs."""
     rest = alike.copy()
     for i, j in chosen:
         rest[i, j] = rest[j, i] = 0

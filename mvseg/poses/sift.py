@@ -41,22 +41,20 @@ class Sift:
         return len(self.px)
 
 
-def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = STRUCTURE.contrast) -> Sift:
+def find_sift(photo: Photo, *, image_size: int, most: int) -> Sift:
     """The features of most contrast.
 
     Args:
         photo: (H, W, 3) uint8 RGB.
         image_size: a photo whose longer side has more pixels is scaled down to it.
         most: number of features that are kept.
-        contrast: least contrast of a feature.
     """
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     factor = min(1.0, image_size / max(grey.shape))
     size = tuple(max(1, round(factor * side)) for side in grey.shape[::-1])
     small = grey if factor == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    finder = cv2.SIFT.create(
-        nfeatures=most, contrastThreshold=contrast, edgeThreshold=STRUCTURE.edge, enable_precise_upscale=True
-    )
+    contrast, edge = STRUCTURE.contrast, STRUCTURE.edge
+    finder = cv2.SIFT.create(most, contrastThreshold=contrast, edgeThreshold=edge, enable_precise_upscale=True)
     points, histograms = finder.detectAndCompute(small, None)
     if not points:
         none = np.zeros(0, np.float32)
@@ -88,19 +86,16 @@ def count_alike(photos: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
     return alike
 
 
-def match_descriptors(
-    one: NDArray[np.uint8], other: NDArray[np.uint8], *, back_ratio: float = STRUCTURE.ratio
-) -> NDArray[np.int64]:
+def match_descriptors(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.int64]:
     """(M, 2) rows of descriptors (A, 128) and (B, 128) that match.
 
-    Each is the other's nearest and nearer than the second nearest: `STRUCTURE.ratio` of it as seen from the first,
-    `back_ratio` of it as seen from the other; 1 asks for the nearest only.
+    Each is the other's nearest, and nearer than `STRUCTURE.ratio` of the second nearest.
     """
     if min(len(one), len(other)) < 2:
         return np.zeros((0, 2), np.int64)
     one, other = (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9) for rows in (one, other))
     cosines = one.astype(np.float32) @ other.astype(np.float32).T
-    return np.argwhere(_clear_best(cosines, STRUCTURE.ratio) & _clear_best(cosines.T, back_ratio).T)
+    return np.argwhere(_clear_best(cosines, STRUCTURE.ratio) & _clear_best(cosines.T, STRUCTURE.ratio).T)
 
 
 def _clear_best(cosines: Floats, ratio: float) -> NDArray[np.bool_]:

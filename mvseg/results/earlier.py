@@ -80,8 +80,6 @@ class _Made(BaseModel):
 
 
 class _Run(BaseModel):
-    """Content of a run file, see `Output.describe`; a file of an earlier version may only list its files."""
-
     output: _Made | None = None
     files: dict[_Name, str] | None = None
 

@@ -127,7 +127,6 @@ def photos_folder(view: View) -> Path:
 
 
 def _write_images(result: Result, folder: Path) -> list[Picture]:
-    """Write labels and overlays; returns the report's pictures, so that photos are read only once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     pictures = []
     views = list(enumerate(scene.views))
@@ -192,7 +191,6 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
 
 
 def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
-    """Mask that the stages work with, of a photo with a lens: to distort and to undistort moves pixels."""
     if result.scene.views[view].lens is None:
         return {}
     width, height = result.scene.cameras.sizes[view].tolist()

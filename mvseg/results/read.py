@@ -217,7 +217,6 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
 def _with_truth(
     regions: Regions, sizes: Sequence[tuple[int, int]], truth: Path, names: Sequence[str]
 ) -> tuple[Regions, list[np.ndarray]]:
-    """The regions of the photos that have true labels, and these: files of V `names` in a folder."""
     taken = [view for view, name in enumerate(names) if (truth / name).is_file()] or list(range(len(names)))
     if left_out := [name for view, name in enumerate(names) if view not in taken]:
         values: Values = {"count": len(left_out), "total": len(names), "names": tuple(left_out)}

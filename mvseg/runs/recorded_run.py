@@ -103,7 +103,6 @@ def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> s
 
 
 def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence[Path]) -> list[Finding]:
-    """Compare what the run read. Only what another run would read is opened: a result may come from anybody."""
     changes = []
     if record.code != code_hash():
         changes.append(Finding("other_version", values={"before": record.mvseg[:60], "now": __version__}))

@@ -290,7 +290,6 @@ class OpenResult:
         return self._before[1]
 
     def _before_edits(self) -> bytes | None:
-        """State of the run before edits; None if the result lacks it, or if something has changed since."""
         path, said = self.folder / BEFORE_EDITS_FILE, self.run.record
         is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
         is_same = is_same and path.stat().st_size <= MOST_BYTES

@@ -130,7 +130,6 @@ def _choose_plant(recorded: RecordedTracks, name: str | None) -> PlantResults:
 
 
 def _describe_question(question: Question) -> dict[str, Any]:
-    """A question in the form that the page reads; "changes" are None until they are computed."""
     return {"before": question.before, "after": question.after, "isLinked": question.is_linked,
             "doubt": round(question.doubt, 3), "changes": None}  # fmt: skip
 

@@ -145,7 +145,6 @@ def _round(value: float, digits: int) -> float | None:
 
 
 def _extent(tracks: Tracks) -> tuple[float, dict[int, np.ndarray]]:
-    """Half the size of the largest plant, and {root: (3,) middle of the plant on all dates that stand in its frame}."""
     clouds: dict[int, list[np.ndarray]] = {root: [np.zeros((0, 3))] for root in tracks.roots}
     for date, root, pose in zip(tracks.dates, tracks.roots, tracks.poses, strict=True):
         clouds[root] += [leaf.points @ pose[:3, :3].T + pose[:3, 3] for leaf in date.leaves if leaf.points is not None]

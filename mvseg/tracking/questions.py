@@ -85,7 +85,6 @@ def describe_changes(now: Tracks, then: Tracks) -> list[str]:
 
 
 def _describe_turns(now: Tracks, then: Tracks) -> Iterator[str]:
-    """Sentences about the dates on which the relative pose to the date before differs."""
     for later in range(1, len(now.dates)):
         one, other = (np.linalg.inv(each.poses[later - 1]) @ each.poses[later] for each in (now, then))
         turn = np.degrees(Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).magnitude())

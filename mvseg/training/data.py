@@ -131,7 +131,6 @@ def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> Sample
 
 
 def _list_lone(photos: Path, labels: Path, masks: MaskFiles) -> list[Sample]:
-    """Files of masks without a photo, as samples, so that the check reports them."""
     known = {path for files in masks.files for path in files}
     suffixes = {path.suffix for path in known}
     lone = [path for path in sorted(labels.rglob("*")) if path.suffix in suffixes - {".txt"} and path not in known]

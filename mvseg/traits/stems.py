@@ -255,7 +255,6 @@ def _is_wider_at_an_end(widths: Floats) -> bool:
 def _of_tubes(
     tubes: Sequence[StemTube], surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
 ) -> tuple[Stem, ...]:
-    """The stems that masks show, each with the leaves that point back to it rather than to another one."""
     ends, others = find_ends(surfaces)
     size = float(np.median(ends.lengths))
     upright = [each.tube.reverse() if _is_reversed(each.tube, upward, ends) else each.tube for each in tubes]

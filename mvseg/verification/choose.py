@@ -157,7 +157,6 @@ def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
 
 
 def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
-    """(D,) bool: whether masks are, pixel for pixel, the proposals that their labels name."""
     labels, regions = matched.regions.labels, proposals.regions
     is_there = (labels >= 0) & (labels < len(proposals))
     for row in is_there.nonzero()[:, 0].tolist():
@@ -260,7 +259,6 @@ def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
 
 
 def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:
-    """The table of the leaves; masks that are held (D,) and show none stay without an id."""
     rows = np.flatnonzero((chosen.leaf >= 0) | is_held)
     rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
     ids = np.where(chosen.leaf[rows] >= 0, chosen.leaf[rows] + 1, -1)

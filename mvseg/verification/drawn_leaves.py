@@ -297,7 +297,6 @@ def _dilate(frame: Frame, radius: int) -> Frame:
 
 
 def _with_parts(regions: Regions, parts: Mapping[int, Crop]) -> Regions:
-    """The regions and, after them, one of each view."""
     boxes, pixels = [each.box for each in parts.values()], [each.pixels.flatten() for each in parts.values()]
     new = stack_regions(list(parts), boxes, pixels, labels=[0] * len(boxes), num_views=regions.num_views)
     columns: dict[str, Any] = {name: torch.cat((getattr(regions, name), getattr(new, name))) for name in COLUMNS}

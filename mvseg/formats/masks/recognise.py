@@ -102,7 +102,6 @@ def _refuse_cvat(path: Path) -> None:
 
 
 def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
-    """Files below a folder, without the scene's cameras, its photos, and copies of these."""
     photos = [view.path for view in scene.views if view.path.is_file()]
     other_files = {path.resolve() for path in (*photos, scene.source) if path is not None}
     of_size: dict[int, list[Path]] = defaultdict(list)

@@ -49,7 +49,6 @@ def find_axes(px_from_world: Floats, middle: Floats, areas: Ints) -> Floats:
 
 
 def _farthest(vectors: Floats) -> Floats | None:
-    """The first of the longest vectors (S, 3), as a unit vector; None where all are short."""
     lengths = np.linalg.norm(vectors, axis=1)
     index = int((lengths >= lengths.max() - STARTS.tie).argmax())
     return vectors[index] / lengths[index] if lengths[index] > STARTS.flat else None

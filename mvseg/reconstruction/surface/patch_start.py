@@ -65,7 +65,6 @@ def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
 
 
 def _thin(points: Floats) -> Floats:
-    """Every so many points, in their order: deterministic, and even for the lattice order of voxels."""
     step = max(1, int(np.ceil(len(points) / STARTS.most_points)))
     return points[::step]
 
