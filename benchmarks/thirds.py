@@ -46,7 +46,7 @@ from benchmarks.drawn_leaves import draw_from, open_views
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
 from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
-from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
+from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.config import RunConfig
 from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.demo import demo_scene
@@ -381,13 +381,10 @@ Links = dict[tuple[str, int, int, int], float]  # {(plant, date, leaf, the leaf 
 
 
 def simulated_series() -> dict[str, Series]:
-    """Five plants of seed 5, eight of seed 20, and four times two plants in one pot."""
-    specs = draw_specs(4, seed=41)
-    pairs = zip(specs, [*specs[1:], *specs[:1]], strict=True)
+    """Five plants of seed 5, and eight of seed 20."""
     return {
         "seed 5": {spec.name: see_series(spec) for spec in draw_specs(5, seed=5)},
         "seed 20": {spec.name: see_series(spec) for spec in draw_specs(8, seed=20)},
-        "two": {one.name: see_two_plants(one, other, turn=60.0) for one, other in pairs},
     }
 
 

@@ -1,7 +1,6 @@
 """The same leaf over days: `mvseg track` against what the field has, on simulated and real plants.
 
     python -m benchmarks.tracking simulated --num_plants 12            leaves as seen: meshes with noise, no photos
-    python -m benchmarks.tracking two --num_plants 8 --turn 60         two of them in one pot, one turned by itself
     python -m benchmarks.tracking results TABLE RESULTS [...]          results of mvseg batch, or of `prepare`
     python -m benchmarks.tracking results TABLE RESULTS --turned 10    the same, each pot turned at random, ten times
     python -m benchmarks.tracking prepare TABLE RESULTS                surfaces from true masks with true ids
@@ -50,13 +49,9 @@ from mvseg.results.result import Instances, Result
 from mvseg.simulation.blades import BLADE_COLUMNS
 from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.series import (
-    PotPlace,
     SeriesSpec,
-    draw_pots,
     draw_specs,
     grow_series,
-    move_plant,
-    plan_plant,
 )
 from mvseg.tracking.dates import Number, PlantOnDate, SeenLeaf, read_date, see_surface
 from mvseg.tracking.leaves import DateLeaves, leaves_of
@@ -118,20 +113,6 @@ def see_series(spec: SeriesSpec, *, noise: float = 1.0, missed: float = 0.05) ->
     seen = [
         see_plant(plant, time, rng, noise=noise, missed=missed, scene=f"{spec.name}_{time:g}") for plant, time in plants
     ]
-    return [date for date, _ in seen], [truth for _, truth in seen]
-
-
-def see_two_plants(one: SeriesSpec, other: SeriesSpec, *, turn: float) -> tuple[list[PlantOnDate], Labels]:
-    """Two plants in one pot on two dates in the middle of a series, the second one turned by itself in between."""
-    first, second, pots = plan_plant(one), plan_plant(other), draw_pots(one)
-    rng, seen = np.random.default_rng([one.seed, 5]), []
-    for index, angle in ((3, 0.0), (4, turn)):
-        day, own = one.times[index], PotPlace(turn=angle, x=220.0)
-        beside = [replace(leaf, leaf_id=leaf.leaf_id + 1000, vertices=own.place(leaf.vertices))
-                  for leaf in second.at(day).leaves]  # fmt: skip
-        plant = first.at(day)
-        both = move_plant(replace(plant, leaves=(*plant.leaves, *beside)), pots[index])
-        seen.append(see_plant(both, day, rng, scene=f"{one.name}_{index}"))
     return [date for date, _ in seen], [truth for _, truth in seen]
 
 
@@ -433,12 +414,11 @@ def calibrate(series: dict[str, tuple[list[PlantOnDate], Labels]], tracked: dict
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("simulated", "two", "prepare", "results"))
+    parser.add_argument("what", choices=("simulated", "prepare", "results"))
     parser.add_argument("places", type=Path, nargs="*")
     parser.add_argument("--num_plants", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--masks", choices=("true", "degraded"), default="true", help="of prepare")
-    parser.add_argument("--turn", type=float, default=60.0, help="of two: degrees by which one plant is turned")
     parser.add_argument("--turned", type=int, default=0, help="of results: draws of turns of all pots")
     parser.add_argument("--methods", nargs="*", default=["nearest base", "shape", "rank", "cpd"])
     args = parser.parse_args()
@@ -451,13 +431,9 @@ def main() -> None:
                 compare_turned(series, args.turned)
             else:
                 compare(series, args.methods)
-    elif args.what == "simulated":
-        specs = draw_specs(args.num_plants, seed=args.seed)
-        compare({spec.name: see_series(spec) for spec in specs}, args.methods)
     else:
         specs = draw_specs(args.num_plants, seed=args.seed)
-        others = zip(specs, [*specs[1:], *specs[:1]], strict=True)
-        compare({one.name: see_two_plants(one, other, turn=args.turn) for one, other in others}, args.methods)
+        compare({spec.name: see_series(spec) for spec in specs}, args.methods)
 
 
 if __name__ == "__main__":

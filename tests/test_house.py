@@ -118,7 +118,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 42_155, "benchmarks": 6_830, "tests": 36_850}
+BUDGET = {"mvseg": 42_150, "benchmarks": 6_800, "tests": 36_840}
 SLACK = 400
 
 

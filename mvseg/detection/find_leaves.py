@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 from torch import Tensor
@@ -122,7 +123,7 @@ class PassResult:
     findings: tuple[Finding, ...] = ()
     colored: Tensor | None = None
 
-    @property
+    @cached_property
     def rating(self) -> Rating:
         """See `rate_pass`."""
         return rate_pass(self.leaves.masks, self.leaves.probabilities, pixel=self.pixel, colored=self.colored)

@@ -40,11 +40,11 @@ class LensReport:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A model after an adjustment with another lens, its noise as a share of that before, and its covariance."""
+    """A model after an adjustment with another lens, its noise as a share of that before, and the adjustment."""
 
     model: pycolmap.Reconstruction
     noise: float
-    covariance: pycolmap.BACovariance | None
+    adjusting: pycolmap.CeresBundleAdjuster
 
 
 def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
@@ -62,8 +62,8 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
         middle = _try(model, _same, is_middle_free=True)
         own_middle = _try(model, _same, is_own=True, is_middle_free=True)
         fisheye = _try(model, _fisheye)
+        aspect, deviation = _aspect(two)
     lengths, spread = _focal_lengths_of_photos(own.model, model)
-    aspect, deviation = _aspect(two)
     is_square_known = deviation < LENS.most_aspect_sd
     others = min(two.noise, middle.noise, fisheye.noise)
     if spread > LENS.zoomed and own.noise < min(LENS.noise_of_zooms, others):
@@ -108,8 +108,7 @@ def _try(model: pycolmap.Reconstruction, lens: Lens, *, is_own: bool = False, is
     adjusting = adjuster(other, options)
     adjusting.solve()
     other.update_point_3d_errors()
-    covariance = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), other, adjusting)
-    return _Trial(other, noise_px(other) / max(noise_px(model), 1e-12), covariance)
+    return _Trial(other, noise_px(other) / max(noise_px(model), 1e-12), adjusting)
 
 
 def _with_lenses(model: pycolmap.Reconstruction, lens: Lens, *, is_own: bool) -> pycolmap.Reconstruction:
@@ -143,9 +142,10 @@ def _focal_lengths_of_photos(
 def _aspect(two: _Trial) -> tuple[float, float]:
     """Width of a pixel in heights, and its standard deviation, of the camera where it is least certain; (1, infinite)
     where it is not determined."""
+    known = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), two.model, two.adjusting)
     worst = 1.0, 0.0
     for camera in two.model.cameras.values():
-        covariance = None if two.covariance is None else two.covariance.get_other_params_cov(camera.params)
+        covariance = None if known is None else known.get_other_params_cov(camera.params)
         if covariance is None:
             return 1.0, math.inf
         x, y = camera.params[:2]

@@ -8,7 +8,6 @@ from types import MappingProxyType
 from typing import Literal
 
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.config import TraitsConfig
 
 # The first ones are the gravest.
@@ -26,7 +25,7 @@ class Rejection:
 
 
 def find_rejected(
-    shapes: Mapping[int, LeafSurface | VoxelGrid],
+    surfaces: Mapping[int, LeafSurface],
     *,
     config: TraitsConfig,
     sure_views: Mapping[int, int] = MappingProxyType({}),
@@ -36,7 +35,7 @@ def find_rejected(
     """The instances that are not measured as leaves.
 
     Args:
-        shapes: {instance id: its shape}, instances without one left out.
+        surfaces: {instance id: its surface}, instances without one left out.
         config: what is asked of a leaf.
         sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
         visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
@@ -46,7 +45,7 @@ def find_rejected(
     Returns:
         {instance id: why}: the gravest of several reasons, see `Kind`.
     """
-    ious = {instance: median_iou(shape) for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
+    ious = {instance: median_iou(surface) for instance, surface in surfaces.items()}
     share = "its masks cover a share of {:.2f} of its surface, asked for is {:g}"
     limits: tuple[tuple[Kind, Mapping[int, float], float, str], ...] = (
         ("hardly_visible", visible_shares, config.min_visible_share, share),

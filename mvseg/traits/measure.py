@@ -165,8 +165,7 @@ def measure_plant(
     """
     instances, masks = range(1, matching.num_instances + 1), matching.masks
     best = {instance: best_shape(instance, surfaces, voxels) for instance in instances}
-    shapes = {instance: shape for instance, shape in best.items() if shape is not None}
-    every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
+    every = {instance: shape for instance, shape in best.items() if isinstance(shape, LeafSurface)}
     frame = None if scene.up is None else level_frame(scene.up)
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     photos = photos or Photos(scene)
@@ -174,7 +173,7 @@ def measure_plant(
     visible = {instance: numbers["visible_share"].value for instance, numbers in appearance.items()}
     tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
     rejected = find_rejected(
-        shapes,
+        every,
         config=config,
         sure_views=sure_views,
         visible_shares=visible,

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 import pytest
@@ -17,8 +17,10 @@ from PIL import Image
 
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement
 from mvseg.checks.turned_masks import low_fit_findings, take_out_of_square, transpose
-from mvseg.cli.options import _with_words
+from mvseg.cli.options import CAN_BE_OFF, _with_words
+from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.opencv_yaml import read_calibration
@@ -26,6 +28,7 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.formats.transforms_json import read_transforms
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
+from mvseg.traits.config import TraitsConfig
 from scene_folders import HEIGHT, WIDTH, write_scene
 from warned import warns_of
 
@@ -178,6 +181,8 @@ def test_other_programs_and_numbers_name_the_mend(plant: Path) -> None:
     assert _with_words({"learn": False, "report": False, "traits": {"stems": False, "leaves_only": False}}) == {
         "learn": "off", "report": False, "traits": {"stems": "off", "leaves_only": False}
     }  # fmt: skip
+    hints = [each for config in (RunConfig, DetectConfig, TraitsConfig) for each in get_type_hints(config).items()]
+    assert {name for name, hint in hints if "'off'" in str(hint)} == set(CAN_BE_OFF)
 
 
 def transforms(folder: Path, top: dict[str, Any], frame: dict[str, Any]) -> Path:
