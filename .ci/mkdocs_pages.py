@@ -22,8 +22,15 @@ SOURCE = f"{REPOSITORY}/blob/{'v' + VERSION if VERSION else 'main'}/"
 ORDER = {
     "Start": ("index.md", "guide.md", "check.md", "results.md", "corrections.md", "glossary.md"),
     "Bring your own": (
-        "own-masks.md", "own-cameras.md", "pose.md", "recipes.md", "fine-tune.md", "batch.md", "tracking.md",
-        "data-out.md", "formats.md",
+        "own-masks.md",
+        "own-cameras.md",
+        "pose.md",
+        "recipes.md",
+        "fine-tune.md",
+        "batch.md",
+        "tracking.md",
+        "data-out.md",
+        "formats.md",
     ),
     "Notebooks": ("notebooks/demo_plant.md", "notebooks/own_arrays.md"),
     "Method": ("matching.md", "surfaces.md", "traits.md", "detector.md"),

@@ -60,7 +60,6 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
-from mvseg.matching.split import split_merged
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -76,7 +75,7 @@ from mvseg.tracking.track import track_leaves
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
-from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, PARTS, ROUGH, SNAP
+from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, ROUGH, SNAP
 from mvseg.verification.snap_edges import snap_masks
 
 FACTOR = 1.33
@@ -205,7 +204,7 @@ class Trial:
     truth: Any
 
 
-CHECKING = (EVIDENCE, PARTS, AGAIN)
+CHECKING = (EVIDENCE, AGAIN)
 CHOOSING = (EVIDENCE, CHOICE, ROUGH, SNAP)
 DRAWING = (DRAWN, COLORS)
 
@@ -252,7 +251,7 @@ def check_trial(name: str, regions: Regions, cameras: Cameras, truth: Iterable[n
 
 def check_anew(masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Masks:
     checked = check_ids(masks, surfaces, cameras=cameras, config=MatchConfig())
-    return split_merged(checked.close_gaps()).close_gaps()
+    return checked.close_gaps()
 
 
 def choose_anew(plant: Plant) -> Masks:
@@ -278,7 +277,7 @@ def draw(case: Case, first: Masks, number: int) -> Masks:
     outlines = regions_from_label_maps(maps)
     drawn = Masks.of(outlines, outlines.labels, torch.ones(len(outlines)), origin=Origin.CORRECTED)
     left = replace(first, instance_ids=ids).select((ids > 0) | (first.view_index % 2 == 0))
-    return Masks.concatenate((left.with_merged(()), drawn)).close_gaps()
+    return Masks.concatenate((left, drawn)).close_gaps()
 
 
 def count_changed(before: Masks, after: Masks) -> int:

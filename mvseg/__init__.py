@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from mvseg.formats.scene_folder import load_masks as load_masks
     from mvseg.formats.scene_folder import load_scene as load_scene
     from mvseg.masks import Masks as Masks
-    from mvseg.masks import MergedMask as MergedMask
     from mvseg.masks import Origin as Origin
     from mvseg.matching.affinity import Affinity as Affinity
     from mvseg.matching.affinity import region_affinity as region_affinity
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MatchReport as MatchReport
-    from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
     from mvseg.pipeline.run_scene import run_scene as run_scene
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig

@@ -34,7 +34,6 @@ class RunConfig:
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level, "board" from ArUco markers that lie flat; None for that of the scene.
-        split_merged: cut a mask that seems to cover two instances in two.
         report: write report.html, the result as one page.
         coco_crowd: how annotations with `iscrowd` in a COCO file are treated: "mask": as all others; "ignore": left
             out.
@@ -53,7 +52,6 @@ class RunConfig:
     scale: float | None = None
     unit: str | None = None
     up: Up | None = None
-    split_merged: bool = False
     report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"
     categories: str | None = None

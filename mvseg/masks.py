@@ -5,7 +5,7 @@ A stage takes `Masks` and gives `Masks` back; nothing about a mask is kept anywh
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any, TypeVar
@@ -28,7 +28,6 @@ COLUMNS = (  # that are tensors
     "classes",
     "origin",
     "is_linked",
-    "second_ids",
 )
 
 
@@ -43,23 +42,6 @@ class Origin(IntEnum):
     CONFIRMED = 5  # the user says that it is right, with the edge that photos give it
 
 
-@dataclass(frozen=True, eq=False)
-class MergedMask:
-    """A mask that seems to cover two instances.
-
-    Attributes:
-        region: its row.
-        own: id of the instance that it was matched to.
-        other: id of the second instance.
-        part: (h, w) bool on the CPU, the pixels of the mask's box that show the second instance.
-    """
-
-    region: int
-    own: int
-    other: int
-    part: Tensor
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Masks:
     """D masks in V views.
@@ -72,8 +54,6 @@ class Masks:
         classes: (D,) int64; masks of different classes are never matched.
         origin: (D,) int64, of `Origin`.
         is_linked: (D,) bool, the user says which other masks show its instance, or do not.
-        second_ids: (D,) int64, id of the second instance that a mask seems to show; -1 for none.
-        second_parts: D times (h, w) bool on the CPU, the pixels of the mask's box that show it; None for none.
 
     Raises:
         InputError: columns of other lengths than there are regions.
@@ -86,14 +66,12 @@ class Masks:
     classes: Tensor
     origin: Tensor
     is_linked: Tensor
-    second_ids: Tensor
-    second_parts: tuple[Tensor | None, ...]
 
     def __repr__(self) -> str:
         return f"Masks({len(self)} in {self.regions.num_views} views, of {self.num_instances} instances)"
 
     def __post_init__(self) -> None:
-        lengths = [len(getattr(self, name)) for name in (*COLUMNS, "second_parts")]
+        lengths = [len(getattr(self, name)) for name in COLUMNS]
         if lengths != [len(self.regions)] * len(lengths):
             raise InputError(f"{len(self.regions)} regions with columns of {lengths} rows, expected one row each")
 
@@ -118,8 +96,6 @@ class Masks:
             classes=integer if classes is None else classes,
             origin=int(origin) * integer,
             is_linked=integer < 0,
-            second_ids=-integer,
-            second_parts=(None,) * count,
         )
 
     def __len__(self) -> int:
@@ -140,19 +116,6 @@ class Masks:
         """K, the largest id."""
         return max(int(self.instance_ids.max()), 0) if len(self) else 0
 
-    @property
-    def merged(self) -> tuple[MergedMask, ...]:
-        """The masks that seem to show two instances, by row."""
-        rows = enumerate(zip(self.instance_ids.tolist(), self.second_ids.tolist(), self.second_parts, strict=True))
-        return tuple(MergedMask(row, own, other, part) for row, (own, other, part) in rows if part is not None)
-
-    def with_merged(self, merged: Iterable[MergedMask]) -> Masks:
-        """The same masks, of which those `merged`, and no others, seem to show two instances."""
-        ids, parts = torch.full_like(self.second_ids, -1), [None] * len(self)
-        for each in merged:
-            ids[each.region], parts[each.region] = each.other, each.part  # type: ignore[call-overload]
-        return replace(self, second_ids=ids, second_parts=tuple(parts))
-
     def to(self, device: torch.device | str) -> Masks:
         columns: dict[str, Any] = {name: getattr(self, name).to(device) for name in COLUMNS}
         return replace(self, regions=self.regions.to(device), **columns)
@@ -161,15 +124,14 @@ class Masks:
         """The rows at an int64 index or a bool mask, in that order; ids stay what they are."""
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in COLUMNS}
-        parts = tuple(self.second_parts[row] for row in keep.tolist())
-        return replace(self, regions=self.regions.select(index), second_parts=parts, **columns)
+        return replace(self, regions=self.regions.select(index), **columns)
 
     def relabel(self, numbers: Tensor) -> Masks:
         """Instance k gets the id `numbers[k - 1]`.
 
         Args:
             numbers: (K,) int64: 1, 2, ... in any order, each once, and -1 for every instance to discard: its masks
-                become unmatched, and nothing shows it as a second instance any more.
+                become unmatched.
 
         Raises:
             InputError: any other numbers.
@@ -181,15 +143,8 @@ class Masks:
             raise InputError(f"{self.num_instances} instances get {len(numbers)} numbers, expected one each")
         lookup = torch.nn.functional.pad(numbers.to(self.instance_ids), (0, 1), value=-1)
 
-        def renumber(ids: Tensor) -> Tensor:
-            return lookup[torch.where(ids > 0, ids - 1, len(numbers))]
-
-        ids = renumber(self.instance_ids)
-        others = torch.where(ids > 0, renumber(self.second_ids), -1)
-        pairs = zip(self.second_parts, (others > 0).tolist(), strict=True)
-        parts = tuple(part if stays else None for part, stays in pairs)
-        scores = self.match_scores * (ids > 0)
-        return replace(self, instance_ids=ids, match_scores=scores, second_ids=others, second_parts=parts)
+        ids = lookup[torch.where(self.instance_ids > 0, self.instance_ids - 1, len(numbers))]
+        return replace(self, instance_ids=ids, match_scores=self.match_scores * (ids > 0))
 
     def close_gaps(self) -> Masks:
         """The ids as 1, 2, ... without gaps, in the order that they have."""
@@ -211,16 +166,15 @@ class Masks:
         """
         shifted, largest = [], 0
         for part in parts:
-            ids, others = (torch.where(each > 0, each + largest, -1) for each in (part.instance_ids, part.second_ids))
-            shifted.append(replace(part, instance_ids=ids, second_ids=others))
+            ids = torch.where(part.instance_ids > 0, part.instance_ids + largest, -1)
+            shifted.append(replace(part, instance_ids=ids))
             largest += part.num_instances
 
         def join(tables: Sequence[Any], names: Sequence[str]) -> dict[str, Any]:
             return {name: torch.cat([getattr(each, name) for each in tables]) for name in names}
 
         joined = join([part.regions for part in parts], ("view_index", "boxes", "crops", "labels"))
-        second_parts = sum((part.second_parts for part in parts), ())
-        return Masks(replace(parts[0].regions, **joined), second_parts=second_parts, **join(shifted, COLUMNS))
+        return Masks(replace(parts[0].regions, **joined), **join(shifted, COLUMNS))
 
     def count_sure_views(self) -> Tensor:
         """(K,) int64: in how many views a mask of each instance has a match score of at least 0.5."""

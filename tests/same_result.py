@@ -45,7 +45,6 @@ def describe(result: Result) -> dict[str, Any]:
         "masks": [masks.regions.mask(row, *size) for row, size in enumerate(sizes)],
         **{name: getattr(masks, name) for name in ("view_index", "instance_ids", "origin", "classes")},
         **{name: getattr(masks, name) for name in ROUNDED[:2]},
-        "masks of two instances": [[each.region, each.other, each.part] for each in masks.merged],
         "report": [report.method, report.residual_px, result.matching.num_instances],
         "probabilities": instances.probabilities,
         "surfaces": _attributes(result.surfaces, surfaces),

@@ -114,25 +114,3 @@ def moved(cameras: Cameras, scale: float, rotation: Tensor, shift: Tensor) -> Ca
     """The same photos in a world that was moved: x' = scale * rotation @ x + shift."""
     R = cameras.R @ rotation.T
     return Cameras(cameras.K, R, scale * cameras.t - (R @ shift[:, None])[:, :, 0], cameras.sizes)
-
-
-def merged_balls(scene: BallScene) -> tuple[Regions, tuple[int, int], int]:
-    """The regions when two touching balls share one mask in a view, labelled as the second; the two numbers; the index
-    of that region."""
-    (first, second), view = touching_balls(scene)
-    maps = [labels.copy() for labels in scene.label_maps]
-    maps[view][maps[view] == first] = second
-    regions = regions_from_label_maps(maps)
-    (region,) = ((regions.view_index == view) & (regions.labels == second)).nonzero()[:, 0].tolist()
-    return regions, (first, second), region
-
-
-def touching_balls(scene: BallScene) -> tuple[tuple[int, int], int]:
-    """The numbers of two balls that touch each other in a view and show as much as possible there; and that view."""
-    best = (0, (0, 0), 0)
-    for view, labels in enumerate(scene.label_maps):
-        sizes = np.bincount(labels.ravel())
-        ends = np.stack([labels[:, 1:].ravel(), labels[:, :-1].ravel()], 1)
-        for a, b in np.unique(ends[(ends[:, 0] != ends[:, 1]) & (ends.min(1) > 0)], axis=0).tolist():
-            best = max(best, (int(min(sizes[a], sizes[b])), (a, b), view))
-    return best[1], best[2]

@@ -213,7 +213,6 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "num_restarts": 2,
             "seed": 9,
         },
-        "split_merged": False,
         "coco_crowd": "mask",
         "categories": None,
         "stem_category": None,
@@ -377,7 +376,7 @@ def test_without_words_there_is_help(capsys: pytest.CaptureFixture[str]) -> None
         ("infer . --match.num_points many", "", "--match.num_points is many, expected a whole number or null"),
         ("infer . --match.num_points 0", "", "--match.num_points is 0"),
         ("infer . --match.search_range [5,3]", "", "match.search_range is"),
-        ("infer . --split_merged=maybe", "", "--split_merged is maybe, expected true or false"),
+        ("infer . --report=maybe", "", "--report is maybe, expected true or false"),
         ("infer . --reconstruct.shape ball", "", "--reconstruct.shape is ball, expected surface, voxels, both"),
         ("infer . --detect.min_score 3", "", "--detect.min_score is 3, expected a number from 0 to 1"),
     ],
@@ -1039,21 +1038,6 @@ def test_a_warning_is_one_line(plant: Path, monkeypatch: pytest.MonkeyPatch) -> 
     first, *others = said.getvalue().splitlines()
     assert first == "mvseg: warning: odd"
     assert others[0].endswith("UserWarning: for developers")
-
-
-def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two touching leaves of the shipped plant share a mask; in the result their pixels have both ids again."""
-    shutil.copytree(demo_scene() / "masks", tmp_path / "masks")
-    true = read_label_png(demo_scene() / "masks" / "003.png", 640, 480)
-    write_label_png(tmp_path / "masks" / "003.png", np.where(true == 10, 1, true))
-    arguments = ["match", str(demo_scene()), "--masks", str(tmp_path / "masks"), "--quiet", "--out", str(tmp_path)]
-    assert main([*arguments, "--split_merged", "true"]) == 0
-    assert "12 instances from 108 masks" in capsys.readouterr().out
-    labels = read_label_png(tmp_path / "demo_plant" / "labels" / "003.png", 640, 480)
-    first, second = (np.bincount(labels[true == leaf]).argmax() for leaf in (1, 10))
-    assert first != second
-    assert np.mean(labels[true == 1] == first) > 0.8
-    assert np.mean(labels[true == 10] == second) > 0.8
 
 
 @pytest.mark.parametrize(("given", "expected"), [(["--num_workers", "3"], 3), ([], 4)])

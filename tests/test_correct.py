@@ -538,7 +538,7 @@ def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
 @pytest.mark.slow
 def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
-    config = RunConfig(reconstruct=None, scale=0.1, unit="cm", split_merged=True)
+    config = RunConfig(reconstruct=None, scale=0.1, unit="cm")
     run_one_scene(RunRequest(scene, scene / "masks", out, config))
     before = json.loads((out / "run.json").read_text())["config"]
     with serve(out) as server:

@@ -11,18 +11,16 @@ import torch
 from matched import matched
 from mvseg.crop import Crop
 from mvseg.errors import InputError
-from mvseg.masks import Masks, MergedMask, Origin, replace_crops
+from mvseg.masks import Masks, Origin, replace_crops
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import regions_from_label_maps
 
-PART = torch.tensor([[True, False]])
-
 
 def table() -> Masks:
-    """Five masks in three views, three instances; mask 2 also shows instance 3."""
+    """Five masks in three views, three instances."""
     labels = np.zeros((3, 6, 9), np.int64)
     labels[0, 1, 0:2], labels[0, 3, 3:5], labels[1, 1, 0:2], labels[1, 3, 3:5], labels[2, 2:4, 2:4] = 1, 2, 1, 2, 1
-    masks = Masks.of(
+    return Masks.of(
         regions_from_label_maps(list(labels)),
         torch.tensor([2, 1, 2, -1, 3]),
         torch.tensor([0.9, 0.8, 0.4, 0.0, 0.6]),
@@ -30,18 +28,12 @@ def table() -> Masks:
         classes=torch.tensor([1, 2, 1, 1, 1]),
         origin=Origin.DETECTED,
     )
-    return masks.with_merged([MergedMask(region=2, own=2, other=3, part=PART)])
-
-
-def merged_of(masks: Masks) -> list[tuple[int, int, int]]:
-    assert all(each.part is PART for each in masks.merged)
-    return [(each.region, each.own, each.other) for each in masks.merged]
 
 
 def same(first: Masks, second: Masks) -> bool:
-    names = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")
+    names = ("instance_ids", "match_scores", "detection_scores", "classes", "origin")
     columns = all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
-    return columns and torch.equal(first.regions.crops, second.regions.crops) and merged_of(first) == merged_of(second)
+    return columns and torch.equal(first.regions.crops, second.regions.crops)
 
 
 def test_selected_rows_keep_what_is_known_of_them() -> None:
@@ -49,9 +41,6 @@ def test_selected_rows_keep_what_is_known_of_them() -> None:
     assert chosen.instance_ids.tolist() == [3, 2]
     assert chosen.match_scores.tolist() == pytest.approx([0.6, 0.4])
     assert chosen.view_index.tolist() == [2, 1]
-    assert merged_of(chosen) == [(1, 2, 3)]
-    assert table().select(torch.tensor([0])).merged == ()
-    assert merged_of(table().select(torch.tensor([2, 0, 2]))) == [(0, 2, 3), (2, 2, 3)]
     assert same(table().select(table().match_scores >= 0), table())
 
 
@@ -60,10 +49,9 @@ def test_a_permutation_and_its_inverse_are_nothing() -> None:
     assert same(table().select(order).select(order.argsort()), table())
 
 
-def test_relabelling_moves_both_ids_of_a_mask() -> None:
+def test_relabelling_and_its_inverse_are_nothing() -> None:
     after = table().relabel(torch.tensor([3, 1, 2]))
     assert after.instance_ids.tolist() == [1, 3, 1, -1, 2]
-    assert merged_of(after) == [(2, 1, 2)]
     assert same(after.relabel(torch.tensor([2, 3, 1])), table())
 
 
@@ -72,7 +60,6 @@ def test_a_discarded_instance_leaves_nothing_behind() -> None:
     assert after.instance_ids.tolist() == [1, 2, 1, -1, -1]
     assert after.match_scores.tolist() == pytest.approx([0.9, 0.8, 0.4, 0, 0])
     assert after.num_instances == 2
-    assert after.merged == ()
 
 
 @pytest.mark.parametrize("numbers", [[1, 1, 2], [0, 1, 2], [2, 3, 4]])
@@ -94,7 +81,6 @@ def test_gaps_between_ids_close_up_and_what_is_known_by_them_follows() -> None:
 def test_concatenated_tables_share_no_instance() -> None:
     joined = Masks.concatenate([table(), table()])
     assert joined.instance_ids.tolist() == [2, 1, 2, -1, 3, 5, 4, 5, -1, 6]
-    assert merged_of(joined) == [(2, 2, 3), (7, 5, 6)]
     assert same(Masks.concatenate([table()]), table())
 
 
@@ -128,5 +114,5 @@ def test_new_pixels_keep_all_else() -> None:
 
 
 def test_columns_have_a_row_for_every_region() -> None:
-    with pytest.raises(InputError, match=r"5 regions with columns of \[4, 5, 5, 5, 5, 5, 5, 5\] rows"):
+    with pytest.raises(InputError, match=r"5 regions with columns of \[4, 5, 5, 5, 5, 5\] rows"):
         replace(table(), instance_ids=torch.ones(4, dtype=torch.int64))

@@ -16,7 +16,6 @@ import pytest
 import torch
 
 import mvseg
-from found_masks import FoundMasks, see_masks
 from known_leaves import bent_blade
 from mvseg import (
     InputError,
@@ -39,9 +38,7 @@ from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import read_masks
-from mvseg.masks import Masks, MergedMask
-from mvseg.matching.match import match_masks
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks
 from mvseg.pipeline.finish import _find_doubtful, shape_leaves
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant, match_given
@@ -53,7 +50,6 @@ from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
-from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
 from warned import warns_of
 
@@ -195,7 +191,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert [each["code"] for each in run["findings"]] == ["no_masks"]
-        ran = {"views", "match", "split_merged", "coco_crowd", "categories", "stem_category", "report"}
+        ran = {"views", "match", "coco_crowd", "categories", "stem_category", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"
@@ -278,43 +274,6 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         assert result.voxels is not None
 
 
-def show_two(masks: Masks) -> Masks:
-    """The left half of the first mask shows the next leaf."""
-    own, part = int(masks.instance_ids[0]), masks.regions.crop(0).clone()
-    part[:, part.shape[1] // 2 :] = False
-    return masks.with_merged([MergedMask(region=0, own=own, other=own % 3 + 1, part=part)])
-
-
-@pytest.mark.parametrize("is_checked", [True, False])
-def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_again(
-    plant: Path, monkeypatch: pytest.MonkeyPatch, is_checked: bool
-) -> None:
-    fits: list[list[int]] = []
-
-    def fit(_: object, ids: torch.Tensor, *__: object, **___: object) -> dict[int, LeafSurface]:
-        fits.append(ids.tolist())
-        return {number: LeafSurface.none(torch.arange(2), "test", "a test") for number in (1, 2, 3)}
-
-    def check(masks: Masks, *_: object, **__: object) -> Masks:
-        return show_two(masks)
-
-    def match(*args: Any, **kwargs: Any) -> Matching:
-        matching = match_masks(*args, **kwargs)
-        return matching.with_masks(show_two(matching.masks))
-
-    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
-    monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.pipeline.plant.match_masks", match)
-    config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
-    result = run_scene(plant, plant / "masks", config)
-    ids = result.matching.instance_ids.tolist()
-    assert result.matching.merged == ()
-    assert ids[1] == ids[0] % 3 + 1
-    assert len(result.regions) == len(ids)
-    whole = [ids[0], *ids[2:]]
-    assert fits == ([whole, ids] if is_checked else [ids])
-
-
 def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
     plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -330,35 +289,9 @@ def test_starts_stay_with_their_leaf_where_halves_of_another_are_joined(
 
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", join)
-    known = match_given(open_scene(plant, plant / "masks", RunConfig(split_merged=True)))
+    known = match_given(open_scene(plant, plant / "masks", RunConfig()))
     shape_leaves(replace(known, instances=Instances(starts=starts)))
     assert asked == [{2: "start of 2", 3: "start of 3"}, {1: "start of 2", 2: "start of 3"}]
-
-
-@pytest.mark.parametrize("verifies", [True, False])
-def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
-    plant: Path, monkeypatch: pytest.MonkeyPatch, verifies: bool
-) -> None:
-    """Before the other views judge them."""
-    regions = load_masks(load_scene(plant), plant / "masks")
-    asked: list[Masks] = []
-
-    matching = match_regions(regions, load_scene(plant).cameras)
-    see_masks(monkeypatch, FoundMasks.of(matching.with_masks(show_two(matching.masks))))
-
-    def choose(matched: Masks, proposals: Masks, **_: object) -> Leaves:
-        asked.append(matched)
-        return Leaves(matched, {}, {}, ())
-
-    monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
-    config = replace(IDS_ONLY, split_merged=True, learn="off", detect=DetectConfig(verify=verifies))
-    result = run_scene(plant, None, config)
-    assert len(result.masks) == len(regions) + 1
-    assert result.masks.merged == ()
-    assert [len(masks) for masks in asked] == [len(regions) + 1] * verifies
-    whole = run_scene(plant, None, replace(config, split_merged=False))
-    assert len(whole.masks) == len(regions)
-    assert len(whole.masks.merged) == 1
 
 
 @pytest.mark.slow

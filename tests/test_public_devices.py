@@ -30,7 +30,6 @@ from mvseg import (
     measure_plant,
     region_affinity,
     shape_distance,
-    split_merged,
 )
 from mvseg.corrections.mask_questions import list_mask_questions
 from mvseg.formats.photos import Photos
@@ -54,7 +53,7 @@ ELSEWHERE = {
 WITHOUT_TENSORS = {
     "__version__", "InputError", "InputWarning", "MatchConfig", "DetectConfig", "TraitsConfig", "ReconstructConfig",
     "RunConfig", "Check", "Finding", "Corrections", "load_corrections", "LeafLink", "Tracks", "track_leaves",
-    "running", "demo_scene", "Traits", "MatchReport", "Matching", "Origin", "MergedMask", "Affinity",
+    "running", "demo_scene", "Traits", "MatchReport", "Matching", "Origin", "Affinity",
 }  # fmt: skip
 # They read files, or take arrays of any kind: what they make is on the CPU.
 MAKERS = {
@@ -95,7 +94,6 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 3)], [(0, 1)])).instance_ids, True),
     "match_masks": (lambda r, c, i: match_masks(masks_of(r, i), c, links=Links.of()).match_scores, True),
     "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
-    "split_merged": (lambda r, c, i: split_merged(match_regions(r, c).masks).instance_ids, True),
     "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).close_gaps().count_sure_views(), True),
     "LeafSurface": (lambda r, c, i: surfaces()[1].project(c)[0], True),
     "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),

@@ -44,10 +44,10 @@ VERBS: dict[str, tuple[ModuleType, str]] = {
 MOST_USED = {
     "pose": ("photos", "out", "marker", "board", "distance", "positions", "unit", "up", "turntable"),
     "infer": ("scene", "again", "masks", "out", "config", "scale", "unit", "up", "views", "learn", "detect.weights",
-              "split_merged", "num_workers", "corrections"),
+              "num_workers", "corrections"),
     "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
               "detect.weights"),
-    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method"),
+    "match": ("scenes", "masks", "out", "config", "categories", "match.method"),
     "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",
               "epochs", "resume"),
 }  # fmt: skip
@@ -117,7 +117,7 @@ def _parse(arguments: Sequence[str]) -> Namespace:
         short = not {"--help_all", "--print_completion"} & {*arguments}
         words = ["--help" if word == "--help_all" else word for word in arguments]
         args = build_parser(short=short).parse_args(words)
-        for name in ("quiet", "report", "split_merged", "coco_crowd", "overwrite"):
+        for name in ("quiet", "report", "coco_crowd", "overwrite"):
             if args.verb and name in args[args.verb] and args[args.verb][name] is None:
                 raise InputError(f"{name} is null, expected a value")
         for name, value in args[args.verb].items() if args.verb else ():

@@ -33,7 +33,7 @@ def run(args: Namespace) -> int:
     if args.masks is None:
         raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
-    plain = {name: args[name] for name in ("split_merged", "report", "coco_crowd", "categories")}
+    plain = {name: args[name] for name in ("report", "coco_crowd", "categories")}
     match = build_options(MatchConfig, args.match, "match.")
     config = RunConfig(views="all", match=match, reconstruct=None, **plain)
     for scene, name in zip(args.scenes, names, strict=True):

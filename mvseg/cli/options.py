@@ -116,7 +116,6 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None = None) -> N
     parser.set_defaults(masks=masks)
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
     parser.add_argument("--report", type=bool, default=True, help="write report.html, the result as one page")
-    parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
     parser.add_class_arguments(MatchConfig, "match")
 
 
@@ -141,7 +140,7 @@ def add_run_options(parser: ArgumentParser) -> None:
 
 def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
-    plain = ("views", "scale", "unit", "split_merged", "report", "coco_crowd", "categories", "stem_category")
+    plain = ("views", "scale", "unit", "report", "coco_crowd", "categories", "stem_category")
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
         match=build_options(MatchConfig, args.match, "match."),

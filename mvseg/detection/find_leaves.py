@@ -17,7 +17,6 @@ from mvseg.errors import collect_warnings
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.matching.split import split_merged
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
@@ -134,7 +133,6 @@ def find_leaves(
     cameras: Cameras,
     *,
     config: DetectConfig = DetectConfig(),
-    splits: bool = False,
     cache: SurfaceCache | None = None,
 ) -> PassResult:
     """The views choose leaves and masks from everything that a pass proposes, see `choose_leaves`.
@@ -142,10 +140,9 @@ def find_leaves(
     Args:
         detected: matched with the same cameras.
         config: `verify`, `min_score` and `min_probability`.
-        splits: cut masks that seem to show two leaves, before the views choose.
     """
     proposals, first = detected.proposals(cameras), detected.sure.masks.to("cpu")
-    matched = [split_merged(first).close_gaps() if splits else first]
+    matched = [first]
     if config.verify:
         with collect_warnings():  # said of the sure ones already
             matched.append(detected.match(cameras, min(DETECTION.more_score, config.min_score)).masks)

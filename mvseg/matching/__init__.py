@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MatchReport as MatchReport
-    from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
 
 __getattr__, __all__ = lazy_names(__name__, __file__)

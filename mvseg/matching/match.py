@@ -28,7 +28,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.threads import on_one_thread
 
-MATCHED = "instance_ids", "match_scores", "second_ids", "second_parts"  # columns of `Masks` that matching fills
+MATCHED = "instance_ids", "match_scores"  # columns of `Masks` that matching fills
 
 
 @check_arguments

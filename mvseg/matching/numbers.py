@@ -108,16 +108,13 @@ class GainNumbers:
 
 @dataclass(frozen=True)
 class PieceNumbers:
-    """When a mask shows a part of an instance, or two of them: segmenters split leaves, and merge them."""
+    """When a mask shows a part of an instance: segmenters split leaves."""
 
     covered: float = 0.05  # chosen: min. share of a second region in a view that its cluster covers
     as_good: float = 0.5  # chosen: score from which a cluster explains a region, relative to its own ones
     few: float = 0.25  # chosen: share of the views up to which a cluster that they show is doubted
     few_covered: float = 0.02  # chosen: share of a doubted cluster's region for another cluster to take it over
-    merged_coverage: float = 0.25  # chosen: share of another cluster's region from which one may share it
-    merged_share: float = 0.2  # definition: min. share of a mask's pixels that each of its two instances explains
     least_score: float = 0.05  # limit: min. score of the best region that others are compared with
-    neighbours: int = 3  # insensitive: nearest sampled pixels that decide where a merged mask is cut: no id
     # A higher one, and ids of degraded masks lose more than strangers go.
     least: float = 0.3  # insensitive: probability of being a piece below which a mask leaves: -0.005, +0.010
 

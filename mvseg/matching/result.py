@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvseg.masks import Masks, MergedMask
+from mvseg.masks import Masks
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +81,6 @@ class Matching:
     def num_instances(self) -> int:
         """K."""
         return self.masks.num_instances
-
-    @property
-    def merged(self) -> tuple[MergedMask, ...]:
-        """Masks that seem to cover two instances. The masks themselves are unchanged (`split_merged` cuts them).
-        "nview" looks for them, and `mvseg infer` asks the surfaces, see docs/matching.md."""
-        return self.masks.merged
 
     @property
     def support(self) -> Tensor | None:

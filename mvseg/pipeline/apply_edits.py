@@ -56,7 +56,6 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
                 edited.masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces
             )
             edited = replace(edited, instances=Instances(starts=starts)).with_masks(masks)
-    edited = edited if opened.is_checked else edited.cut_merged()
     if not opened.is_chosen:
         return edited
     with timed("choose"):

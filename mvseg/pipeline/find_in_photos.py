@@ -129,8 +129,7 @@ def run_pass(
     """
     with collect_warnings() as findings:
         detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        cameras, splits = opened.scene.cameras, opened.config.split_merged and not opened.is_checked
-        result = find_leaves(detected, cameras, config=detect, splits=splits, cache=opened.surfaces)
+        result = find_leaves(detected, opened.scene.cameras, config=detect, cache=opened.surfaces)
     return replace(result, findings=tuple(findings))
 
 

@@ -54,7 +54,6 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         plant = complete_masks(plant)
     if opened.is_checked:
         plant, num_moved = verify_ids(plant, fit_leaves(plant, same_segmenter))
-        plant = plant.cut_merged()
     shapes = opened.config.reconstruct
     surfaces = None if shapes is None or shapes.shape == "voxels" else fit_leaves(plant, same_segmenter)
     shown = surfaces or plant.instances.starts

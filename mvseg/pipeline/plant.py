@@ -16,7 +16,6 @@ from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.matching.split import split_merged
 from mvseg.pipeline.open_scene import Opened
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
@@ -127,10 +126,6 @@ class Plant:
         chosen = replace(self, instances=instances, rejected=leaves.rejected, agreement=leaves.agreement)
         return chosen.with_masks(leaves.masks)
 
-    def cut_merged(self) -> Plant:
-        """Cut masks that show two leaves, where the options ask for it."""
-        return self.with_masks(split_merged(self.masks)) if self.opened.config.split_merged else self
-
 
 def match_given(opened: Opened) -> Plant:
     """The same id for given masks of the same leaf, see `match_masks`."""
@@ -150,7 +145,7 @@ def match_given(opened: Opened) -> Plant:
         rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return plant if opened.is_checked else plant.cut_merged()  # surfaces tell better which masks show two
+    return plant
 
 
 def whole_photos(scene: Scene) -> Tensor:

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from torch import Tensor
 
 from mvseg.corrections.file import dump_edits
 from mvseg.detectors.weights_file import DETECTOR_FILE
@@ -161,9 +159,8 @@ def _describe_camera(scene: Scene, view: int) -> dict[str, Any]:
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
     masks, view = result.masks, int(result.masks.view_index[region])
-    instance, other = int(masks.instance_ids[region]), int(masks.second_ids[region])
+    instance, kind = int(masks.instance_ids[region]), int(masks.classes[region])
     track = {"track_id": instance} if instance > 0 else {}
-    part, kind = masks.second_parts[region], int(masks.classes[region])
     origin, score = Origin(int(masks.origin[region])), float(masks.detection_scores[region])
     source: dict[str, Any] = {}
     if origin == Origin.GIVEN:
@@ -184,8 +181,6 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         **source,
         "segmentation": encode_mask(mask_in_photo(result, region)),
         **_undistorted(result, region, view),
-        **({"other_instance_id": other} if other > 0 else {}),
-        **({} if part is None else {"other_part": encode_mask(_in_frame(result, region, part))}),
         **({"mask_class": kind} if kind != 1 else {}),
     }
 
@@ -195,11 +190,6 @@ def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
         return {}
     width, height = result.scene.cameras.sizes[view].tolist()
     return {"undistorted": encode_mask(result.regions.mask(region, width, height).cpu().numpy())}
-
-
-def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
-    width, height = result.scene.cameras.sizes[int(result.masks.view_index[region])].tolist()
-    return replace(result.regions.placed(region), pixels=part).paste((width, height)).numpy()
 
 
 def _chance_of(result: Result, instance: int) -> float | None:

@@ -28,7 +28,7 @@ from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read
 from mvseg.formats.label_png import read_label_png, read_labels
 from mvseg.formats.lens import undistort
 from mvseg.formats.run_lengths import Rle, decode_crop, decode_rle
-from mvseg.masks import Masks, MergedMask, Origin
+from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.results.earlier import RUN_FILE
@@ -83,8 +83,6 @@ class _Mask(BaseModel):
     source_label: Int64 | None = None
     from_other_views: bool = False
     corrected: Literal["outline", "split", "confirm"] | None = None
-    other_instance_id: int = Field(-1, ge=-1, le=MOST_INSTANCES)
-    other_part: Rle | None = None
     mask_class: Int64 = 1
 
     @property
@@ -262,7 +260,7 @@ def _as_tensor(numbers: object, *shape: int) -> Tensor:
 
 def _table_of(content: _Instances, scene: Scene) -> Masks:
     view_of = {image.id: view for view, image in enumerate(content.images)}
-    views, boxes, crops, merged = [], list[Box](), [], []
+    views, boxes, crops = [], list[Box](), []
     for row, each in enumerate(content.annotations):
         with faults_of(f"annotations[{row}]"):
             if each.image_id not in view_of:
@@ -271,10 +269,6 @@ def _table_of(content: _Instances, scene: Scene) -> Masks:
             box, crop = _decode(each, scene, views[-1])
             boxes.append(box)
             crops.append(torch.from_numpy(crop.copy()).flatten())
-            if each.other_part is not None:
-                frame = decode_rle(each.other_part.counts, *scene.cameras.sizes[views[-1]].tolist())
-                part = torch.from_numpy(Crop(box, torch.from_numpy(crop)).cut(frame).copy())
-                merged.append(MergedMask(region=row, own=each.instance_id, other=each.other_instance_id, part=part))
     rows = content.annotations
     labels = [row if each.source_label is None else each.source_label for row, each in enumerate(rows, start=1)]
     masks = Masks.of(
@@ -283,9 +277,8 @@ def _table_of(content: _Instances, scene: Scene) -> Masks:
         torch.tensor([each.match_score for each in rows], dtype=torch.float32),
         detection_scores=torch.tensor([each.score for each in rows], dtype=torch.float32),
         classes=torch.tensor([each.mask_class for each in rows], dtype=torch.int64),
-    ).with_merged(merged)
-    others = torch.tensor([each.other_instance_id for each in rows], dtype=torch.int64)
-    return replace(masks, origin=torch.tensor([int(each.origin) for each in rows]).long(), second_ids=others)
+    )
+    return replace(masks, origin=torch.tensor([int(each.origin) for each in rows]).long())
 
 
 def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:

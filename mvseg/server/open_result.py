@@ -16,7 +16,6 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 from pydantic import BaseModel, Field
-from torch import Tensor
 
 from mvseg.corrections.file import Corrections, Point, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
@@ -339,12 +338,7 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
         numbers[instance] = next(new)
     number_of.update({name: numbers[instance] for instance, _, name, _ in named})
 
-    def renumber(ids: Tensor) -> Tensor:
-        return torch.tensor([numbers.get(each, -1) for each in ids.tolist()], dtype=torch.int64, device=ids.device)
-
-    merged = [each for each in masks.merged if each.other in numbers]
-    masks = masks.with_merged(merged)
-    kept = replace(masks, instance_ids=renumber(masks.instance_ids), second_ids=renumber(masks.second_ids))
+    kept = replace(masks, instance_ids=torch.tensor([numbers.get(each, -1) for each in ids]).to(masks.instance_ids))
     return replace(result, matching=result.matching.with_masks(kept), instances=result.instances.renumber(numbers))
 
 

@@ -4,8 +4,7 @@ Rays and epipolar lines know nothing of shape. A surface that is fitted to an in
 each view must show of it. So the instances of given masks are candidates, and those that the matcher finds once more
 (`match_again.py`), and `choose` asks which masks show them. Given masks count as proposals with a detection score of
 `CHOICE.given`. A mask keeps its id unless another leaf takes it with a q of `SURE` or more, and no mask of its view
-stays with that leaf. Where two surfaces explain one mask in disjoint parts, it shows two leaves (`find_shared`). Not in
-the paper.
+stays with that leaf. Not in the paper.
 """
 
 from __future__ import annotations
@@ -15,20 +14,19 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from mvseg.masks import SURE, Masks, MergedMask
+from mvseg.masks import SURE, Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.choice import choose
 from mvseg.verification.choose import gather_candidates
-from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, paint_view, see
+from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import Candidates, show_chances
 from mvseg.verification.match_again import match_again
-from mvseg.verification.numbers import AGAIN, CHOICE, PARTS
+from mvseg.verification.numbers import AGAIN, CHOICE
 
 
 def check_ids(
@@ -42,12 +40,10 @@ def check_ids(
     """Move masks to the instances whose surfaces they show.
 
     These may be instances that are found among the masks that do not show their own. No mask loses its id without
-    getting another. With fewer than `AGAIN.least_views` views, masks that are surely matched stay. Last, the masks that
-    show two surfaces are marked as merged (`find_shared`).
+    getting another. With fewer than `AGAIN.least_views` views, masks that are surely matched stay.
 
     Args:
-        masks: D masks. A merged mask that moves loses that mark, unless two surfaces are found in it again. Masks that
-            the user corrected or linked keep an id that they have; a corrected one without any may get one.
+        masks: D masks. Those that the user corrected or linked keep their id; corrected ones without any may get one.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         config: that the masks were matched with.
 
@@ -76,9 +72,6 @@ def check_ids(
     leaf = np.where(is_moved, to, leaf)
     names = np.concatenate((names, table.num_instances + 1 + np.arange(len(candidates) - len(names)), [-1]))
     ids = names[leaf]
-    named = [each for each in table.merged if not is_moved[each.region] and (ids == each.other).any()]
-    shared = find_shared(table.with_merged(named), candidates, drawn, leaf, names=names, cameras=cameras)
-    merged = {each.region: each for each in (*named, *shared)}
     scores = torch.from_numpy(np.where(is_moved, chosen.q, table.match_scores.double().numpy())).float()
     checked = replace(
         table,
@@ -86,7 +79,7 @@ def check_ids(
         match_scores=scores,
         detection_scores=masks.detection_scores.cpu(),
     )
-    return replace(checked.with_merged(merged.values()).to(masks.view_index.device), regions=masks.regions)
+    return replace(checked.to(masks.view_index.device), regions=masks.regions)
 
 
 def _gather(
@@ -121,50 +114,3 @@ def find_moves(leaf: Ints, to: Ints, views: Ints, *, q: Floats) -> Bools:
     while (is_blocked := is_moved & (is_rival & ~is_moved).any(1)).any():
         is_moved &= ~is_blocked
     return is_moved
-
-
-def find_shared(
-    masks: Masks,
-    candidates: Candidates,
-    drawn: Sequence[Drawn],
-    leaf: Ints,
-    *,
-    names: Ints,
-    cameras: Cameras,
-) -> list[MergedMask]:
-    """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
-
-    Half of the image of the second one must lie in the mask, or the matcher must have named the two: a mask that is
-    drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The second part are
-    the pixels that are nearer to the visible part of the second surface than to that of the first.
-
-    Args:
-        masks: D masks with the ids of the matcher, and the pairs of leaves that it named (`Masks.merged`).
-        candidates: K.
-        drawn: V views of both.
-        leaf: (D,) the candidate that each mask shows; -1 for none.
-        names: (K + 1,) ids of the candidates.
-    """
-    pairs = {(each.region, each.own, each.other) for each in masks.merged}
-    regions, every, index = masks.regions, np.arange(len(leaf)), np.arange(len(candidates))
-    is_there = np.isin(index, leaf) & np.isin(names[:-1], masks.instance_ids) & candidates.is_credible
-    inside = np.where(is_there, see(drawn, len(leaf), is_there).inside, 0.0)
-    inside = np.column_stack((inside, np.zeros(len(leaf))))  # of no candidate
-    by_own = inside[every, leaf]
-    inside[every, leaf] = 0
-    second, by_second = inside.argmax(1), inside.max(1)
-    is_explained = (np.minimum(by_own, by_second) >= PARTS.least_each) & (by_own + by_second >= PARTS.least_both)
-    surfaces = {int(names[n]): each for n, each in enumerate(candidates.surfaces) if is_there[n] and each is not None}
-    views, shared = regions.view_index.numpy(), []
-    for view in np.unique(views[is_explained]).tolist():
-        painted = paint_view(surfaces, cameras, view)
-        for region in np.flatnonzero(is_explained & (views == view)).tolist():
-            pair = int(names[leaf[region]]), int(names[second[region]])
-            crop = regions.placed(region)
-            mask = crop.pixels.numpy()
-            seen = np.where(mask, crop.cut(painted), 0)
-            if (region, *pair) in pairs or 2 * (seen == pair[1]).sum() >= (painted == pair[1]).sum():
-                to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
-                part = torch.from_numpy(mask & (to_second < to_first))
-                shared.append(MergedMask(region=region, own=pair[0], other=pair[1], part=part))
-    return shared

@@ -109,7 +109,7 @@ def choose_leaves(
     added = matched.select(is_added)
     row_of = matched.regions.labels.clone()
     row_of[is_added] = len(proposals) + torch.arange(len(added))
-    table = _mark(Masks.concatenate((proposals, added.with_merged(()))), matched, row_of)
+    table = _mark(Masks.concatenate((proposals, added)), matched, row_of)
     statements = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
     usable = np.ones(len(table), bool)
     if removed is not None:
@@ -147,7 +147,7 @@ def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
 
 def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
     """The masks, and after them the others that show something else than these (`EVIDENCE.shared`); by view."""
-    both = Masks.concatenate((masks, others.with_merged(())))
+    both = Masks.concatenate((masks, others))
     is_added = torch.ones(len(both), dtype=torch.bool)
     for each in draw_views(both.regions, (), cameras.to("cpu")):
         is_first = each.rows < len(masks)

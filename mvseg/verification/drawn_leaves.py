@@ -194,7 +194,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
             parts[view] = leaf_colored.tighten()
     first = int((ids == leaf).nonzero()[0, 0])
     rows = torch.cat((torch.arange(len(masks)), torch.full((len(parts),), first)))
-    more = replace(masks, instance_ids=ids).with_merged(masks.merged).select(rows)
+    more = replace(masks, instance_ids=ids).select(rows)
     is_new = torch.arange(len(rows)) >= len(masks)
     return replace(
         more,

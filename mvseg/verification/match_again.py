@@ -49,7 +49,7 @@ def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config
         return None
     ids = again.masks.instance_ids
     is_old = torch.isin(ids, ids[torch.from_numpy(~is_free)]) | _comes_of_one(ids, leaf)
-    return replace(again.masks.with_merged(()), instance_ids=ids.where(~is_old, -1))
+    return replace(again.masks, instance_ids=ids.where(~is_old, -1))
 
 
 def _comes_of_one(ids: Tensor, leaf: Ints) -> Tensor:

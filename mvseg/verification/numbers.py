@@ -28,14 +28,6 @@ class RoughNumbers:
 
 
 @dataclass(frozen=True)
-class PartNumbers:
-    """Masks that show two leaves."""
-
-    least_each: float = 0.2  # chosen: min. fraction of a mask that each of the two leaves it shows covers
-    least_both: float = 0.7  # chosen: and both together
-
-
-@dataclass(frozen=True)
 class AgainNumbers:
     """Masks that are matched again."""
 
@@ -97,7 +89,6 @@ class SnapNumbers:
 
 EVIDENCE = EvidenceNumbers()
 ROUGH = RoughNumbers()
-PARTS = PartNumbers()
 AGAIN = AgainNumbers()
 CHOICE = ChoiceNumbers()
 DRAWN = DrawnNumbers()

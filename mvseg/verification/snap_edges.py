@@ -45,11 +45,11 @@ def snap_masks(
         cache: {digest of the arguments of `snap`: what it returned}; earlier ones are taken from it, new ones added.
 
     Returns:
-        The same rows, on the CPU. Masks that no detector found, and those that show two instances, stay as they are.
+        The same rows, on the CPU. Masks that no detector found stay as they are.
     """
     cache = {} if cache is None else cache
     regions = masks.regions.to("cpu")
-    moves = (torch.isin(masks.origin, FOUND.to(masks.origin)) & (masks.second_ids < 0)).cpu()
+    moves = torch.isin(masks.origin, FOUND.to(masks.origin)).cpu()
     crops = [regions.placed(row) for row in range(len(regions))]
     for view in regions.view_index[moves].unique().tolist():
         photo = photos(view)

@@ -250,7 +250,7 @@ def test_the_options_are_those_of_infer(tmp_path: Path) -> None:
     (tmp_path / "run.yaml").write_text("match: {seed: 4}\nunit: cm\ncategories: leaf\n")
     words = ["--config", str(tmp_path / "run.yaml"), "--detect.min_score", "0.4", "--reconstruct.shape", "voxels"]
     words += ["--traits.leaves_only", "false", "--scale", "2", "--up", "0 0 1"]
-    words += ["--split_merged", "true", "--coco_crowd", "ignore", "--report", "false"]
+    words += ["--coco_crowd", "ignore", "--report", "false"]
     words += ["--views", "12", "--learn", "2", "--stem_category", "stem"]
     infer, both = (build_run(build_parser().parse_args([verb, "x", *words])[verb]) for verb in ("infer", "batch"))
     assert infer == both

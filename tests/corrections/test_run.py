@@ -19,10 +19,9 @@ from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, load_corrections, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
 from mvseg.formats.rig import write_rig
-from mvseg.masks import Masks, MergedMask, Origin
+from mvseg.masks import Masks, Origin
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.matching.split import split_merged
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import match_given
@@ -161,11 +160,6 @@ def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin, monkey
         monkeypatch.setattr("mvseg.verification.choose.fit_roughly", lambda *_, known=surfaces: known)
         chosen = choose_leaves(numbered, numbered, cameras=CAMERAS)
         assert squares(chosen.masks) == (stays if origin in CORRECTED or not surfaces else [])
-    row = int(((masks.view_index == 2) & (masks.instance_ids == 1)).nonzero()[0, 0])
-    half = torch.zeros(9, 9, dtype=torch.bool)
-    half[:4] = True
-    cut = split_merged(masks.with_merged([MergedMask(region=row, own=1, other=2, part=half)]))
-    assert len(cut) == len(masks) + (origin not in CORRECTED)
 
 
 @pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])

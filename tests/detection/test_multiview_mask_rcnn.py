@@ -28,7 +28,7 @@ from mvseg.matching.result import Matching
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from simulated_proposals import simulate_proposals
-from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at
 
 # what an untrained detector finds in noise does not agree across views
 pytestmark = pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
@@ -292,26 +292,18 @@ def test_what_stays_says_that_views_disagree_and_no_earlier_matching_warns() -> 
 
 
 def test_classes_are_matched_apart_and_their_matchings_joined() -> None:
-    """True masks of balls, the even ones of another class; one mask of class 1 covers two balls."""
+    """True masks of balls, the even ones of another class."""
     scene = ball_scene(6, 8, seed=3)
-    regions, (small, large), _ = merged_balls(scene)
-    first = (regions.labels == small) | (regions.labels == large)
-    classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
+    regions = scene.regions
+    classes = torch.where(regions.labels % 2 == 1, 1, 2)
     order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
     proposals = Masks.of(regions, detection_scores=torch.rand(len(regions)), classes=classes).select(order)
     matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
-    labels = matching.masks.regions.labels
     assert matching.support is not None
     assert len(matching.support) == matching.num_instances == 6
     assert matching.report.residual_px == 1
     for instance in range(1, 7):
         assert len(matching.masks.classes[matching.instance_ids == instance].unique()) == 1
-    (merged,) = matching.merged
-    assert labels[merged.region] == large
-    assert matching.instance_ids[merged.region] == merged.own
-    assert merged.part.shape == matching.masks.regions.crop(merged.region).shape
-    shown = [int(labels[matching.instance_ids == number].mode().values) for number in (merged.own, merged.other)]
-    assert sorted(shown) == sorted((small, large))
 
 
 def test_detections_per_view_are_limited() -> None:

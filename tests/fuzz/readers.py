@@ -225,8 +225,7 @@ RESULT = {
         for image, name in zip(IMAGES, NAMES, strict=True)
     ],
     "annotations": [
-        {"image_id": view, "instance_id": 1, "segmentation": encode_mask(MASK), "match_score": 0.9, "source_label": 3,
-         "other_instance_id": 2, "other_part": encode_mask(MASK)}
+        {"image_id": view, "instance_id": 1, "segmentation": encode_mask(MASK), "match_score": 0.9, "source_label": 3}
         for view in range(VIEWS)
     ],
 }  # fmt: skip

@@ -139,7 +139,7 @@ PAST_FAILURES: list[tuple[str, str, bytes]] = [
     ("result", "instances.json", with_value(RESULT, *FIRST, "instance_id", value=2**63)),
     ("result", "instances.json", with_value(RESULT, "images", 0, "name", value="../../x")),
     ("result", "instances.json", with_value(RESULT, "images", 0, "name", value="\0")),
-    ("result", "instances.json", with_value(RESULT, *FIRST, "other_part", "counts", value=[10**30])),
+    ("result", "instances.json", with_value(RESULT, *FIRST, "segmentation", "counts", value=[10**30])),
     ("result", "run.json", with_value(RESULT_RUN, "format", value=3)),
     ("result", "run.json", with_value(RESULT_RUN, "edits", value=[3])),
     ("result", "surfaces.npz", b"PK"),

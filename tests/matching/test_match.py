@@ -11,10 +11,9 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.findings.sentences import DISAGREEMENT
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions, odd_views
-from mvseg.matching.split import split_merged
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
-from synthetic import ball_scene, cameras_at, merged_balls, permute_views, render_balls
+from synthetic import ball_scene, cameras_at, permute_views, render_balls
 from warned import warns_of
 
 
@@ -29,7 +28,6 @@ def test_shipped_scene_is_solved(
     assert matching.num_instances == 12
     assert matching.match_scores.min() > 0.3
     assert matching.match_scores.max() <= 1
-    assert matching.merged == ()
     if method in ("auto", "nview"):
         assert matching.support is not None
         assert matching.support.shape == (12,)
@@ -104,34 +102,6 @@ def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
     maps = [labels.repeat(2, 0).repeat(2, 1) if view == 1 else labels for view, labels in enumerate(scene.label_maps)]
     with pytest.raises(InputError, match=r"region \d of view 1 has the box .* inside the 320 x 240 pixels"):
         match_regions(regions_from_label_maps(maps), scene.cameras, MatchConfig(method=method))
-
-
-def test_merged_masks_can_be_cut_in_two() -> None:
-    """Every pixel keeps exactly one region; only the merged mask is cut, about where the two balls meet."""
-    scene = ball_scene(6, 8, seed=3)
-    regions, balls, merged = merged_balls(scene)
-    matching = match_regions(regions, scene.cameras)
-    assert [mask.region for mask in matching.merged] == [merged]
-    matched = split_merged(matching.masks)
-    cut, source = matched.regions, torch.tensor(sorted([*range(len(regions)), merged]))
-    assert len(cut) == len(regions) + 1
-    assert matched.merged == ()
-    assert torch.equal(matched.match_scores, matching.match_scores[source])
-    assert torch.equal(cut.view_index, regions.view_index[source])
-    whole = torch.arange(len(regions)) != merged
-    assert torch.equal(matched.instance_ids[whole[source]], matching.instance_ids[whole])
-    pieces = (source == merged).nonzero()[:, 0].tolist()
-    first, second = (cut.mask(piece, 320, 240) for piece in pieces)
-    assert not (first & second).any()
-    assert torch.equal(first | second, regions.mask(merged, 320, 240))
-    truth = torch.from_numpy(scene.label_maps[int(regions.view_index[merged])])
-    shown = [int(truth[piece].mode().values) for piece in (first, second)]
-    assert sorted(shown) == sorted(balls)
-    instances = [int(matching.instance_ids[whole][regions.labels[whole] == ball][0]) for ball in shown]
-    assert matched.instance_ids[pieces].tolist() == instances
-    again = split_merged(matched)
-    assert torch.equal(again.regions.crops, cut.crops)
-    assert torch.equal(again.instance_ids, matched.instance_ids)
 
 
 def test_views_that_agree_on_nothing_are_warned_of() -> None:

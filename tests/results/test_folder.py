@@ -28,7 +28,6 @@ from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.scene_folder import load_masks
-from mvseg.masks import MergedMask
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -123,19 +122,14 @@ class TestContent:
         assert list(saved.parent.iterdir()) == [saved]
 
     def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
-        part = torch.zeros_like(result.regions.crop(3))
-        merged = (MergedMask(region=3, own=1, other=3, part=part),)
         report = replace(result.matching.report, residual_px=2)
         is_unsure = result.masks.view_index < result.masks.instance_ids - 1  # instance 2 in one view, 3 in two
         scores = torch.where(is_unsure, 0.1, 0.9)
-        masks = replace(result.masks, match_scores=scores).with_merged(merged)
+        masks = replace(result.masks, match_scores=scores)
         matching = replace(result.matching, masks=masks, report=report)
         traits = measure_plant(result.scene, matching, surfaces=None, voxels=result.voxels or {})
         instances = replace(result.instances, traits=traits)
         save_result(replace(result, matching=matching, instances=instances), tmp_path / "out", {})
-        annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-        others = {n: entry["other_instance_id"] for n, entry in enumerate(annotations) if "other_instance_id" in entry}
-        assert others == {3: 3}
         assert [row["sure_views"] for row in read_rows(tmp_path / "out")] == ["4", "3", "2"]
         assert json.loads((tmp_path / "out" / "run.json").read_text())["residual_px"] == 2
 
@@ -214,7 +208,7 @@ class TestContent:
         described = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
         content = json.loads((saved / "instances.json").read_text())
         rows = (saved / "traits.csv").read_text().splitlines()
-        names = {*content["annotations"][0], *content["images"][0], *rows[0].split(","), "other_instance_id", "score"}
+        names = {*content["annotations"][0], *content["images"][0], *rows[0].split(","), "score"}
         names |= json.loads((saved / "run.json").read_text()).keys() - {"config"}
         names |= {path.name for path in saved.iterdir() if path.is_file()}
         assert [name for name in sorted(names) if f"`{name}`" not in described] == []

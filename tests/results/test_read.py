@@ -27,7 +27,7 @@ from mvseg.findings.finding import Finding
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.run_lengths import decode_crop, decode_rle, encode_mask
-from mvseg.masks import MergedMask, Origin
+from mvseg.masks import Origin
 from mvseg.matching.result import MatchReport
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
@@ -66,10 +66,8 @@ def balls(plant: Path) -> Result:
 @pytest.fixture(scope="module")
 def rich(balls: Result) -> Result:
     """Something of everything that a result may hold: a surface, one with doubts, voxels, and a leaf without a shape;
-    masks of every origin, one of two leaves, one unmatched; and corrections."""
-    part = torch.zeros_like(balls.regions.crop(3))
-    part[: len(part) // 2] = True
-    masks = balls.masks.with_merged([MergedMask(region=3, own=int(balls.masks.instance_ids[3]), other=3, part=part)])
+    masks of every origin, one unmatched; and corrections."""
+    masks = balls.masks
     origin = torch.arange(len(masks)) % len(Origin)
     ids = masks.instance_ids.clone()
     ids[-1] = -1

@@ -13,7 +13,7 @@ from torch import Tensor
 from blade_scene import SIZE, as_regions
 from known_leaves import flat_leaf
 from matched import matched
-from mvseg.masks import Masks, MergedMask
+from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids, find_moves
@@ -53,15 +53,12 @@ def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor
     wrong[one], wrong[other] = 2, 1
     scores = torch.full((len(ids),), 0.9)
     scores[one], scores[other] = 0.1, 0.2
-    merged = MergedMask(region=one, own=2, other=1, part=regions.crop(one))
-    before = matched(regions, wrong, scores).masks.with_merged([merged])
-    checked = check_ids(before, LEAVES, cameras=CAMERAS)
+    checked = check_ids(matched(regions, wrong, scores).masks, LEAVES, cameras=CAMERAS)
     assert torch.equal(checked.instance_ids, ids)
     assert is_moved(wrong, checked).nonzero()[:, 0].tolist() == sorted([one, other])
     is_swapped = is_moved(wrong, checked)
     assert torch.equal(checked.match_scores[~is_swapped], scores[~is_swapped])
     assert checked.match_scores[is_swapped].min() > 0.99  # q
-    assert checked.merged == ()
 
 
 @pytest.mark.parametrize(("num_views", "is_certain"), [(4, True), (5, False)])
@@ -71,64 +68,6 @@ def test_few_views_do_not_overrule_a_sure_match(num_views: int, is_certain: bool
     ids[place_of(regions, leaves, 2, 1)], ids[place_of(regions, leaves, 2, 2)] = 2, 1
     checked = check_ids(matched(regions, ids).masks, LEAVES, cameras=CAMERAS[list(range(num_views))])
     assert torch.equal(checked.instance_ids, ids if is_certain else leaves)
-
-
-def merged_maps(view: int, share: float) -> list[np.ndarray]:
-    """In this view, the mask of leaf 1 covers this share of leaf 2 as well, what is nearest, and leaf 2 has none."""
-    maps = true_maps()
-    gap = distance_transform_edt(maps[view] != 1)
-    is_second = maps[view] == 2
-    is_near = is_second & (gap <= np.quantile(gap[is_second], share))
-    maps[view][is_second] = 0
-    maps[view][is_near] = 1
-    return maps
-
-
-@pytest.mark.parametrize(
-    ("share", "is_named", "is_listed"), [(1, False, True), (0.49, False, False), (0.49, True, True)]
-)
-def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, is_listed: bool) -> None:
-    """By most of what its view shows of the second one, or where the matcher says so; its cut is that of surfaces."""
-    regions, ids = as_regions(merged_maps(3, share))
-    region = place_of(regions, ids, 3, 1)
-    named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
-    before = matched(regions, ids).masks.with_merged([named] if is_named else [])
-    checked = check_ids(before, LEAVES, cameras=CAMERAS)
-    assert torch.equal(checked.instance_ids, ids)
-    assert [(mask.region, mask.own, mask.other) for mask in checked.merged] == [(region, 1, 2)] * is_listed
-    x1, y1, x2, y2 = regions.boxes[region].tolist()
-    is_second = torch.from_numpy(true_maps()[3][y1:y2, x1:x2] == 2) & regions.crop(region)
-    assert is_second.sum() > 0.2 * regions.areas[region]
-    for mask in checked.merged:
-        assert torch.equal(mask.part, is_second)
-
-
-def is_listed(maps: list[np.ndarray]) -> bool:
-    """Whether the mask of leaf 1 in view 3, which the matcher says shows leaf 2 as well, does so by their surfaces."""
-    regions, ids = as_regions(maps)
-    region = place_of(regions, ids, 3, 1)
-    named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
-    merged = check_ids(matched(regions, ids).masks.with_merged([named]), LEAVES, cameras=CAMERAS).merged
-    return any(mask.part.any() for mask in merged)  # what the matcher named stays on the list
-
-
-@pytest.mark.parametrize(("second", "is_merged"), [(0.18, False), (0.22, True)])
-def test_a_mask_shows_two_leaves_from_a_fifth_of_it_on(second: float, is_merged: bool) -> None:
-    true = true_maps()[3]
-    sizes = [(true == leaf).sum() for leaf in (1, 2)]
-    assert is_listed(merged_maps(3, second / (1 - second) * sizes[0] / sizes[1])) == is_merged
-
-
-@pytest.mark.parametrize(("explained", "is_merged"), [(0.62, False), (0.78, True)])
-def test_two_surfaces_must_explain_most_of_a_mask(explained: float, is_merged: bool) -> None:
-    """The mask of leaves 1 and 2 is drawn too large, over what shows nothing."""
-    maps = merged_maps(3, 1)
-    maps[3][maps[3] != 1] = 0
-    number = int((maps[3] == 1).sum() * (1 / explained - 1))
-    gap = distance_transform_edt(maps[3] != 1) + 1000 * (true_maps()[3] == 3)
-    nearest = np.unravel_index(np.argsort(np.where(gap > 0, gap, np.inf), axis=None, kind="stable")[:number], gap.shape)
-    maps[3][nearest] = 1
-    assert is_listed(maps) == is_merged
 
 
 def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> None:
@@ -142,7 +81,6 @@ def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> No
     over = flat_leaf(length=0.8, half_width=0.35, at=(-0.8, -0.3, 0.42))
     checked = check(regions, ids, LEAVES | {4: over})
     assert torch.equal(checked.instance_ids, leaves)
-    assert checked.merged == ()
     assert torch.equal(checked.close_gaps().instance_ids, leaves)
 
 
@@ -152,23 +90,6 @@ def test_an_instance_without_a_surface_keeps_its_masks(scene: tuple[Regions, Ten
     surfaces = {**LEAVES, 3: LeafSurface.none(torch.arange(6), "test", "its masks do not tell its shape")}
     checked = check(regions, ids, surfaces)
     assert torch.equal(checked.instance_ids, ids)
-    assert checked.merged == ()
-
-
-def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
-    """A merged mask that is drawn three pixels too large; and what the matcher alone calls merged stays on the list."""
-    maps = merged_maps(3, 1)
-    maps[3] = np.where(distance_transform_edt(maps[3] != 1) <= 3, 1, maps[3])
-    regions, ids = as_regions(maps)
-    region, alone = place_of(regions, ids, 3, 1), place_of(regions, ids, 0, 3)
-    named = MergedMask(region=alone, own=3, other=1, part=regions.crop(alone))
-    merged = check_ids(matched(regions, ids).masks.with_merged([named]), LEAVES, cameras=CAMERAS).merged
-    assert [mask.region for mask in merged] == sorted([alone, region])
-    part = next(mask.part for mask in merged if mask.region == region)
-    x1, y1, x2, y2 = regions.boxes[region].tolist()
-    true = true_maps()[3]
-    nearest = [distance_transform_edt(true != leaf)[y1:y2, x1:x2] for leaf in (1, 2)]
-    assert torch.equal(part, regions.crop(region) & torch.from_numpy(nearest[1] < nearest[0]))
 
 
 def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(scene: tuple[Regions, Tensor]) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from blade_scene import as_regions
 from matched import matched
-from mvseg.masks import Masks, MergedMask
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids
@@ -38,14 +38,11 @@ def unsure(regions: Regions, ids: Tensor, rows: Tensor) -> Masks:
 def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions, Tensor, Tensor]) -> None:
     regions, leaves, ids = scattered
     is_second = leaves == 2
-    rows = is_second.nonzero()[:, 0].tolist()
-    merged = [MergedMask(region=rows[0], own=1, other=3, part=regions.crop(rows[0]))]
-    masks = unsure(regions, ids, is_second).with_merged(merged)
+    masks = unsure(regions, ids, is_second)
     found = check_ids(masks, SURFACES, cameras=CAMERAS)
     assert torch.equal(found.instance_ids, torch.where(is_second, 4, ids))
     assert torch.equal(found.match_scores[~is_second], masks.match_scores[~is_second])
     assert found.match_scores[is_second].min() > 0.5
-    assert found.merged == ()
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(3))
     again = check_ids(masks.select(order), SURFACES, cameras=CAMERAS)
     assert torch.equal(again.instance_ids, found.instance_ids[order])

@@ -3,8 +3,7 @@
 Pairs of views cannot tell apart leaves that share their epipolar lines; a third view can. What the views show along the
 rays of each region (`plane_sweep.py`) gives initial partitions (`initialisation.py`); the search (`search.py`) improves
 them by how well clusters explain all views (`cluster_scores.py`); what shares a photo with its leaf and is likelier a
-stranger than a piece leaves (`pieces.py`); then every id gets a probability (`match_scores.py`), and masks that cover
-two instances are found (`merged_masks.py`).
+stranger than a piece leaves (`pieces.py`); then every id gets a probability (`match_scores.py`).
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from mvseg.masks import Masks
 from mvseg.matching.numbers import NVIEW
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
-from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.pieces import part_pieces
 from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
@@ -63,7 +61,7 @@ def match_nview(
     )
     probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
     masks = Masks.of(ordered.to("cpu"), clusters.instance_ids(), probabilities)
-    masks = masks.with_merged(find_merged(best.scores, clusters, ordered)).select(order.argsort().cpu())
+    masks = masks.select(order.argsort().cpu())
     masks = masks.relabel(_final_numbers(masks.instance_ids))
     return Matching(replace(masks.to(regions.device), regions=regions), report)
 

@@ -37,7 +37,6 @@ class MaskContour:
         height: height of its number.
         match_score: see `Matching`.
         is_sure: whether that is at least 0.5.
-        other: id of a second instance that the mask seems to cover, None for most.
     """
 
     region: int
@@ -48,7 +47,6 @@ class MaskContour:
     height: int
     match_score: float
     is_sure: bool
-    other: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +113,7 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
 def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
     that the picture shows (`box`, xyxy, pixels), too: the user may look for them."""
-    regions, others = masks.regions, masks.second_ids.tolist()
+    regions = masks.regions
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]
     outlines = []
@@ -137,7 +135,6 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
                 height=int(np.clip(thickness, LEAST_HEIGHT, LARGEST_HEIGHT)),
                 match_score=round(score, 4),
                 is_sure=score >= SURE,
-                other=others[region] if others[region] > 0 else None,
             )
         )
     return outlines

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.masks import Masks, MergedMask
+from mvseg.masks import Masks
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.report.pictures import UNITS, outline_masks, trace_mask
 
@@ -61,12 +61,10 @@ def test_large_masks_come_first_and_numbers_lie_inside() -> None:
     labels[100:130, 120:160] = 3
     labels[0:10, 0:30] = 4  # outside of the box: not hidden
     regions = regions_from_label_maps([labels, labels])
-    part = torch.zeros(40, 60, dtype=torch.bool)
-    merged = (MergedMask(region=1, own=5, other=2, part=part),)
-    masks = as_masks(regions, [3, 5, -1, 1, 1, 2, 3, 4]).with_merged(merged)
+    masks = as_masks(regions, [3, 5, -1, 1, 1, 2, 3, 4])
     found = outline_masks(masks, view=0, box=BOX)
-    said = [(outline.region, outline.leaf, outline.other) for outline in found]
-    assert said == [(1, 5, 2), (2, -1, None), (3, 1, None), (0, 3, None)]
+    said = [(outline.region, outline.leaf) for outline in found]
+    assert said == [(1, 5), (2, -1), (3, 1), (0, 3)]
     assert found[2].box[2:] < (0, 0)
     assert [outline.is_sure for outline in found] == [True, True, True, True]
     assert [outline.is_sure for outline in outline_masks(masks, view=1, box=BOX)][2:] == [False, True]

@@ -55,14 +55,12 @@ function describeQuality(leaf) {
 function cropButton({ view, index, mask }, leaf, addresses) {
   const match = `match ${mask.match_score.toFixed(2)}${mask.is_sure ? "" : "?"}`;
   const found = mask.detection_score === undefined ? null : `found ${mask.detection_score.toFixed(2)}`;
-  const other = mask.other === null ? null : `and leaf ${mask.other}?`;
-  const title = [view.name, "match score, detection score, a second leaf that the mask may cover"].join(": ");
+  const title = [view.name, "match score, detection score"].join(": ");
   const button = element("button", { type: "button", title },
     drawCrop(view, mask, addresses.pictures[index], leaf.color),
     element("span", {}, view.name),
     element("span", { class: mask.is_sure ? "note" : "doubt" }, match),
-    found && element("span", { class: "note" }, found),
-    other && element("span", { class: "doubt" }, other));
+    found && element("span", { class: "note" }, found));
   button.addEventListener("click", () => shownView.show(index));
   return button;
 }
