@@ -15,12 +15,8 @@ Frame = TypeVar("Frame", Tensor, np.ndarray)
 
 @dataclass(frozen=True, eq=False)
 class Crop:
-    """A mask as the crop of a box.
-
-    Attributes:
-        box: x1, y1, x2, y2 in pixels, half-open; it may reach beyond the photo.
-        pixels: (y2 - y1, x2 - x1) bool.
-    """
+    """A mask as a crop: `pixels` (y2 - y1, x2 - x1) bool of a `box` x1, y1, x2, y2 in pixels, half-open, which may
+    reach beyond the photo."""
 
     box: Box
     pixels: Tensor

@@ -59,8 +59,8 @@ def warn(finding: Finding | Warning) -> None:
 
 @contextmanager
 def collect_warnings() -> Iterator[list[Finding]]:
-    """The findings of InputWarnings inside the block, each once, when it ends, also by an exception; they are not
-    given. Other warnings are."""
+    """Collect the findings of InputWarnings inside the block, each once, when it ends, also by an exception; they are
+    not given. Other warnings are."""
     findings: list[Finding] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
@@ -103,7 +103,7 @@ def faults_of(where: object) -> Iterator[None]:
 
 
 def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
-    """Decorates a public function: an argument that the signature says is one of `OWN`, and that is none, is refused
+    """Decorates a public function: an argument that should be one of `OWN`, by the signature, and is none, is refused
     with one sentence (InputError), in place of an AttributeError from somewhere inside."""
     signature = inspect.signature(function)
     named = {name: str(each.annotation) for name, each in signature.parameters.items() if str(each.annotation) in OWN}
@@ -122,11 +122,8 @@ def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
 
 def check_choices(config: object, place: str = "") -> None:
     """Refuse a value of a field of a frozen config that is none of its `Literal`, and none of the other types that the
-    field may have; `place` is the name of its group of options, "" for those that have none.
-
-    Raises:
-        InputError: names the field, the value, and what there is to choose from.
-    """
+    field may have; `place` is the name of its group of options, "" for those that have none. Raises InputError: names
+    the field, the value, and the choices."""
     for name, hint in get_type_hints(type(config)).items():
         value, members = getattr(config, name), get_args(hint) if get_origin(hint) in UNIONS else (hint,)
         choices = [each for member in members if get_origin(member) is Literal for each in get_args(member)]

@@ -159,11 +159,7 @@ class Regions:
         return replace(self.select(kept), view_index=view_index[kept], num_views=len(views))
 
     def pixels(self) -> tuple[Tensor, Tensor]:
-        """Centres of the mask pixels.
-
-        Returns:
-            xy (P, 2) float32, pixel centres at half integers; owner (P,) int64, the region of each.
-        """
+        """Centres of the mask pixels: xy (P, 2) float32, at half integers, and owner (P,) int64, the region of each."""
         flat = self.crops.nonzero()[:, 0]
         of_region = torch.stack((self.offsets[:-1], self.crop_sizes[:, 0], self.boxes[:, 0], self.boxes[:, 1]))
         start, width, x1, y1 = (torch.repeat_interleave(of, self.areas, output_size=len(flat)) for of in of_region)
@@ -175,7 +171,7 @@ class Regions:
         return xy, owner
 
     def thin(self, most: int) -> tuple[Regions, Tensor, Tensor]:
-        """Masks of more than `most` pixels, thinned to a square lattice of at most about `most` points; a sliver that
+        """Thin masks of more than `most` pixels to a square lattice of at most about `most` points; a sliver that
         misses every lattice point keeps all of its pixels.
 
         Returns:
@@ -202,12 +198,8 @@ class Regions:
         return self.crops.split(self.crop_sizes.prod(1).tolist())
 
     def runs(self, longest: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The mask pixels as runs along the rows of the image, of at most `longest` pixels.
-
-        Returns:
-            xy (P, 2) float32, the centre of the first pixel of each run; length (P,) int64, pixels; owner (P,) int64,
-            the region of each, ordered.
-        """
+        """The mask pixels as runs along the rows of the image, of at most `longest` pixels: xy (P, 2) float32, the
+        centre of the first pixel of each run; length (P,) int64, pixels; owner (P,) int64, its region, ordered."""
         widths, heights = self.crop_sizes.unbind(1)
         region = torch.repeat_interleave(heights)
         row = torch.arange(len(region), device=self.device) - (heights.cumsum(0) - heights)[region]
@@ -229,11 +221,8 @@ class Regions:
         return xy, (length[of_run] - begin).clamp(max=longest), region[of_row][of_run]
 
     def spread_pixels(self, most: int) -> tuple[Tensor, Tensor]:
-        """At most `most` pixels of each region, evenly spread over its pixels in reading order.
-
-        Returns:
-            xy (Q, 2) float32, pixel centres; region (Q,) int64, ordered.
-        """
+        """At most `most` pixels of each region, evenly spread over its pixels in reading order: xy (Q, 2) float32,
+        pixel centres; region (Q,) int64, ordered."""
         picked = [torch.zeros(0, dtype=torch.int64, device=self.device)]
         for part in self._parts():
             flat = part.nonzero()[:, 0]
@@ -246,15 +235,8 @@ class Regions:
         return corner.float() + 0.5, region
 
     def label_map(self, view: int, values: Tensor, size: Sequence[int]) -> Tensor:
-        """Paint the regions of one view into one frame.
-
-        Args:
-            values: (D,) int64, what to paint for each region; regions with value 0 or less are left out.
-            size: width and height of the frame, pixels.
-
-        Returns:
-            (height, width) int64, 0 where no region is. Where regions overlap the smaller one is on top.
-        """
+        """Paint the regions of one view into one frame of `size` width, height, each with its value of (D,) int64; 0 or
+        less: left out. Returns (height, width) int64, 0 elsewhere. The smaller of overlapping regions is on top."""
         frame = torch.zeros(size[1], size[0], dtype=torch.int64, device=self.device)
         members = (self.view_index == view).nonzero()[:, 0]
         members = members[self.areas[members].argsort(descending=True, stable=True)]
@@ -271,10 +253,8 @@ def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
 
 
 def masks_to_boxes(masks: Tensor) -> Tensor:
-    """(N, 4) int64 xyxy, half-open, of (N, H, W) masks; all 0 for a mask without pixels.
-
-    torchvision's function of this name gives boxes that end on the last pixel, and requires a pixel in every mask.
-    """
+    """(N, 4) int64 xyxy, half-open, of (N, H, W) masks; all 0 for a mask without pixels. torchvision's function of this
+    name gives boxes that end on the last pixel, and requires a pixel in every mask."""
     ends = []
     for axis in (1, 2):  # over the rows, for x; over the columns, for y
         is_occupied = masks.bool().any(axis)
@@ -319,10 +299,8 @@ def _slices(box: np.ndarray) -> tuple[slice, slice]:
 
 
 def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:
-    """{number: x1, y1, x2, y2 (half-open)} of an integer label map (H, W), without 0 and 65535.
-
-    `BAND` rows are looked at together, since this needs arrays that are several times as large.
-    """
+    """{number: x1, y1, x2, y2 (half-open)} of an integer label map (H, W), without 0 and 65535. `BAND` rows are looked
+    at together, since this needs arrays that are several times as large."""
     boxes: dict[int, tuple[int, int, int, int]] = {}
     for top in range(0, len(label_map), BAND):
         band = np.asarray(label_map[top : top + BAND])
@@ -341,7 +319,6 @@ def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:
 
 
 def _number_densely(band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers that occur, ascending, and the band with 1, 2, ... in their place."""
     highest = int(band.max())
     if band.dtype.kind in "iu" and band.min() >= 0 and highest <= np.iinfo(np.uint16).max:  # looked up, not sorted
         occurs = np.zeros(highest + 1, bool)

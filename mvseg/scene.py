@@ -116,17 +116,13 @@ class Cameras:
 
     @property
     def unit_px(self) -> float:
-        """Pixels per unit, in which what depends on drawn masks is judged: a 700th of the photos' diagonal, at least
-        one pixel. Masks and features of large photos are less exact."""
+        """Unit of measures that depend on drawn masks, in pixels: a 700th of the photos' diagonal, at least one pixel.
+        Masks and features of large photos are less exact."""
         return max(1.0, float(self.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
 
     def nearest_point(self, views: Tensor, directions: Tensor) -> Tensor:
-        """(3,) the world point nearest to N rays in the least squares; of parallel rays, one of many.
-
-        Args:
-            views: (N,) int64, from whose camera each ray starts.
-            directions: (N, 3) in world axes, of any length.
-        """
+        """(3,) the world point nearest to N rays in the least squares; of parallel rays, one of many. Each starts at
+        the camera of `views` (N,) int64; `directions` (N, 3) in world axes are of any length."""
         return nearest_point(self.centers[views], directions)
 
     def scale(self, factor: float) -> Cameras:
@@ -134,10 +130,7 @@ class Cameras:
         return replace(self, t=factor * self.t)
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Project world points into every view.
-
-        Args:
-            points: (P, 3) world coordinates.
+        """Project world points (P, 3) into every view.
 
         Returns:
             (V, P, 2) float64 pixel positions and (V, P) depths along +z in world units. Points with depth <= 0 lie
@@ -149,12 +142,8 @@ class Cameras:
 
 
 def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
-    """(3,) the point nearest to N rays in the least squares; of parallel rays, one of many.
-
-    Args:
-        origins: (N, 3) where each ray starts.
-        directions: (N, 3) of any length.
-    """
+    """(3,) the point nearest to N rays in the least squares, from `origins` (N, 3) along `directions` (N, 3) of any
+    length; of parallel rays, one of many."""
     rays = torch.nn.functional.normalize(directions, dim=1)
     across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
     # From the mean origin: far from the world's origin the products would cancel.
@@ -211,7 +200,7 @@ class Scene:
     Attributes:
         name: the folder's name.
         views: one `View` per camera.
-        cameras: the undistorted `Cameras`, in the order of the views.
+        cameras: undistorted, in the order of the views.
         unit: name of the world unit ("mm", "m", ...); "" when the cameras do not say.
         source: the file or folder that the cameras were read from.
         up: unit vector (x, y, z) of the world that points up; None when the cameras do not say.
@@ -255,8 +244,8 @@ class Scene:
         """Do the cameras contradict `up`? False where it is not known.
 
         People and gantries look down on plants, or at them from the side with the camera upright. Here the cameras look
-        up by more than ten degrees in the mean, or are level and hang upside down. The leaves cannot tell: which of
-        their sides is the upper one is told by the cameras, too.
+        up by more than ten degrees in the mean, or are level and hang upside down. The leaves cannot tell: the cameras
+        tell which of their sides is the upper one, too.
         """
         if self.up is None:
             return False

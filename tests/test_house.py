@@ -118,7 +118,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 41_850, "benchmarks": 6_800, "tests": 36_550}
+BUDGET = {"mvseg": 40_950, "benchmarks": 6_800, "tests": 36_550}
 SLACK = 400
 
 
@@ -280,7 +280,7 @@ def test_numbers_of_a_room_stand_in_one_place() -> None:
     assert {module for module, names in heads.items() if names} == BESIDE
 
 
-MOST_NUMBERS, MOST_CHOSEN = 659, 335  # 550 and 200 are where they are to go
+MOST_NUMBERS, MOST_CHOSEN = 661, 336  # 550 and 200 are where they are to go
 WORDS = "definition", "limit", "fitted", "insensitive", "chosen"  # of numbers
 
 

@@ -1,9 +1,4 @@
-"""Region matching: masks and cameras in, instance ids out.
-
-    from mvseg.matching import MatchConfig, match_regions
-
-The public names of this room; they are imported when they are first used.
-"""
+"""Region matching: masks and cameras in, instance ids out. Public names are imported when they are first used."""
 
 from __future__ import annotations
 

@@ -21,7 +21,6 @@ class Affinity:
     Attributes:
         edges: (E, 2) int64, pairs of regions of different views, first < second, each pair once.
         weights: (E,) float32 in (0, 1], the mean of the two directions of Eq. 3; pairs of weight 0 are left out.
-        num_regions: D.
     """
 
     edges: Tensor
@@ -39,15 +38,13 @@ class Affinity:
 
 @check_arguments
 def region_affinity(regions: Regions, cameras: Cameras, *, num_points: int | None = None, seed: int = 0) -> Affinity:
-    """Affinity of all pairs of regions in different views (Eq. 3), symmetrised.
+    """Affinity of all pairs of regions in different views (Eq. 3), symmetrised. The graph is on the device of the
+    regions.
 
     Args:
-        cameras: V cameras. Pairs of views that share a camera centre are skipped: their regions get no edge.
+        cameras: pairs of views that share a camera centre are skipped: their regions get no edge.
         num_points: random pixels per region that send out epipolar lines (the paper: 200). None, the default, uses all
             pixels: no slower, and without sampling noise.
-
-    Returns:
-        The graph, on the device of the regions. A region of weight 0 to all regions of the other views has no edge.
     """
     samples, members = view_runs(regions)
     senders = None if num_points is None else draw_points(view_samples(regions)[0], num_points, seed)
@@ -68,14 +65,8 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     """Both directions of Eq. 3 for the regions of two views.
 
     w(n -> m) is the fraction of m's pixels inside the band of n, times the fraction of n's lines that pass through m.
-
-    Args:
-        bins: B half-planes of the two views' pencil.
-        pixels: (N, B) and (M, B) float32, pixels of the regions of view i and of view j in each bin.
-        lines: (N, B) and (M, B) float32, lines that the same regions send out in each bin.
-
-    Returns:
-        w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
+    `pixels` and `lines` hold (N, B) and (M, B) float32: pixels of the regions of views i and j in each bin, and lines
+    that they send out. Returns w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
     """
     bands = tuple(dilate(lines[side], bins.band_radius(side)) for side in (0, 1))
     inside = bands[0] @ pixels[1].T, bands[1] @ pixels[0].T  # pixels of the other view in each region's band

@@ -1,9 +1,8 @@
 """The epipolar pencil of two cameras (Eqs. 1, 2 and 4), without drawing a line.
 
-Two cameras and their baseline b span a pencil of half-planes bounded by b. A pixel of either image lies in exactly one
-of them, and that half-plane is all that epipolar geometry knows about the pixel: its epipolar line in the other image
-(Eq. 1) is where the same half-plane meets that image. So a region is a histogram over the angle of the half-plane, its
-epipolar band (Eq. 2) is the set of occupied bins, and an epipolar map (Eq. 4) is a look-up.
+Two cameras and their baseline span a pencil of half-planes. A pixel of either image lies in exactly one of them; its
+epipolar line in the other image (Eq. 1) is where the same half-plane meets that image. So a region is a histogram over
+the half-plane's angle, its epipolar band (Eq. 2) the set of occupied bins, and an epipolar map (Eq. 4) a look-up.
 
 Departure from the paper: half-planes instead of full lines. The half of a line beyond the epipole belongs to points
 behind one of the cameras; where both epipoles lie outside the images the two agree.
@@ -34,7 +33,6 @@ class Bins:
     Attributes:
         low: smallest angle.
         per_unit: bins per unit of angle.
-        num_bins: B.
         half_line: half the thickness of a line in image i and in image j, in bins.
         half_pixel: half a pixel in image i and in image j, in bins, rounded up.
     """
@@ -50,11 +48,8 @@ class Bins:
         return torch.sub(angles, self.low).mul_(self.per_unit).floor_().clamp_(-1, self.num_bins).int()
 
     def band_radius(self, source: int) -> int:
-        """How many bins a band of image `source` (0 or 1) extends beyond its pixels' centres.
-
-        Half a line in the other image, but at least half a pixel of the source: otherwise the lines of neighbouring
-        pixels would leave gaps where the source image is the coarser one.
-        """
+        """Bins by which a band of image `source` (0 or 1) extends beyond its pixels' centres: half a line in the other
+        image, but at least half a pixel of the source, lest neighbouring lines of a coarser source leave gaps."""
         return max(self.half_line[1 - source], self.half_pixel[source])
 
 
@@ -63,12 +58,10 @@ class Spans:
     """The half-planes of S samples of N regions of one view.
 
     Attributes:
-        low: (S,) the smallest angle of each.
-        high: (S,) the largest; the same tensor for pixels.
+        low, high: (S,) the smallest and the largest angle of each; the same tensor for pixels.
         owner: (S,) int64 in [0, N).
         weight: (S,) float32, number of mask pixels.
         num_pixels: sum of the weights.
-        num_regions: N.
     """
 
     low: Tensor
@@ -101,12 +94,9 @@ def find_spans(pencil: Pencil, side: int, samples: Samples) -> Spans:
 def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> Bins:
     """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
-    A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; it is two
-    pixels on average over the pixels of each image. Both views need at least one pixel.
-
-    Args:
-        pitches: angle per pixel in views i and j, see `mean_pitches`.
-        angles: angles of the pixels of views i and j, at least the smallest and the largest of each.
+    A line is a wedge of the pencil, so its thickness varies with the distance to the epipole; it is two pixels on
+    average over the pixels of each image. `pitches` are `mean_pitches` of views i and j; `angles` hold at least the
+    smallest and the largest angle of the pixels of each. Both views need at least one pixel.
     """
     ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
@@ -150,9 +140,6 @@ class BinnedPair:
     """Two views with a baseline, and their regions as histograms over the half-planes of their pencil.
 
     Attributes:
-        i: the first view.
-        j: the second view.
-        pencil: of i and j.
         bins: common to both.
         pixels: (N, B) and (M, B) float32, pixels of each region of i and of j in each bin.
         lines: (N, B) and (M, B) float32, lines that the same regions send out in each bin.
@@ -172,12 +159,8 @@ def binned_pairs(
     *,
     senders: Sequence[Samples] | None = None,
 ) -> Iterator[BinnedPair]:
-    """All pairs of views i < j that both have pixels, with a baseline between them.
-
-    Args:
-        samples: pixels of the regions, one entry per view.
-        senders: the pixels that send out lines; None for all.
-    """
+    """All pairs of views i < j that both have pixels, with a baseline between them. `samples` and `senders`, the pixels
+    that send out lines (None: all), have an entry per view."""
     skip = is_coincident(cameras).tolist()
     occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
@@ -200,7 +183,7 @@ def binned_pairs(
 def _pair_pitches(
     samples: Sequence[Samples], pairs: Sequence[tuple[int, int]], pencils: Sequence[Pencil]
 ) -> list[tuple[float, float]]:
-    """The pitch of each pair of views in its first and in its second view; all pairs of a view at once."""
+    """The pitch of each pair of views in its first and in its second view."""
     pitches = [[0.0, 0.0] for _ in pairs]
     for view, sample in enumerate(samples):
         sides = [(index, pair.index(view)) for index, pair in enumerate(pairs) if view in pair]
@@ -213,7 +196,6 @@ def _pair_pitches(
 
 
 def _thin(samples: Samples) -> Tensor:
-    """Select about `EPIPOLAR.pitch_pixels` of many pixels, on a square lattice: enough for a mean, in any order."""
     step = int((samples.num_pixels / EPIPOLAR.pitch_pixels) ** 0.5)
     if step < 2:
         return samples.pixels().xy
@@ -230,16 +212,8 @@ def dilate(counts: Tensor, radius: int) -> Tensor:
 
 
 def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
-    """Test which pixels of a view lie in the epipolar band of which region (Eq. 2).
-
-    Args:
-        regions: D regions; those of `view` itself, and of views that share its camera centre, have no band there.
-        view: the view that the bands are projected onto.
-        xy: (P, 2) float32 pixel positions in that view.
-
-    Returns:
-        (D, P) bool.
-    """
+    """Test which pixels `xy` (P, 2) float32 of a view lie in the epipolar band of which of D regions (Eq. 2): (D, P)
+    bool. Regions of `view` itself, and of views that share its camera centre, have no band there."""
     bands = torch.zeros(len(regions), len(xy), dtype=torch.bool, device=regions.device)
     if not len(xy):
         return bands
@@ -262,8 +236,7 @@ def epipolar_map(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -
 
     Args:
         regions: the members of the cluster. Members in `view` itself have no band there and do not count.
-        view: the view that the map belongs to.
-        xy: (P, 2) float32 pixel positions in that view.
+        xy: (P, 2) float32 pixel positions in the view that the map belongs to.
 
     Returns:
         (P,) float32 in [0, 1]; zeros when no member lies in another view.

@@ -1,4 +1,4 @@
-"""What the user knows of masks: that they show one leaf, or different ones. Not in the paper.
+"""Links of the user between masks: they show one leaf, or different ones. Not in the paper.
 
 Masks that must be together are one node of the graph, and those that cannot never join one cluster: the search itself
 honours both (`ViewGraph`), so that a link pulls the rest of its leaf.
@@ -62,11 +62,8 @@ class Links:
         return bool(is_together[0].all() and not is_together[1].any())
 
     def components(self, num_regions: int) -> Ints:
-        """(D,) number of the regions that must be together, transitively.
-
-        Raises:
-            InputError: a region that is not there, or two that must and cannot be together.
-        """
+        """(D,) number of the regions that must be together, transitively. Raises InputError: a region that is not
+        there, or two that must and cannot be together."""
         pairs, apart = self.must.cpu().numpy(), self.cannot.cpu().numpy()
         for region in np.concatenate((pairs.ravel(), apart.ravel())).tolist():
             if not 0 <= region < num_regions:

@@ -98,17 +98,15 @@ def match_masks(
     num_instances: Mapping[int, int] = MappingProxyType({}),
     residual_px: int | None = None,
 ) -> Matching:
-    """Match the masks of a table, class by class; what else is known of them stays.
+    """Match the masks of a table, class by class; other columns than `MATCHED` stay.
 
     Args:
-        masks: D masks; their ids are forgotten.
         links: of their rows; those between masks of different classes have no effect.
         num_instances: {class: number of instances}, where an earlier matching has found it; "symnmf" only.
 
     Returns:
         The matching; instances of different classes have different ids. Its method is that of the config where it is
-        not the same for all classes. Warns as `match_regions` does, but not of views that do not agree: that is left to
-        who knows whether this matching stays, see `find_disagreement`.
+        not the same for all classes. Warns as `match_regions` does, but leaves `find_disagreement` to the caller.
     """
     parts, rows = [], []
     for label in masks.classes.unique().tolist() or [1]:
@@ -131,7 +129,6 @@ def match_masks(
 
 
 def _factorise(regions: Regions, graph: ViewGraph, _: Clusters | None, *, config: MatchConfig) -> Clusters:
-    """SymNMF of the nodes of the graph; of nodes that links keep apart, see `ViewGraph.part`."""
     weights = torch.from_numpy(graph.contract()).float().to(regions.device)
     clustering = cluster_weights(weights, regions.num_per_view, config)
     return graph.part(Clusters.of(clustering.instance_ids.cpu().numpy()[graph.node]))
@@ -193,14 +190,13 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
 def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detected: bool = False) -> Finding | None:
     """The finding where the views disagree about the masks; None elsewhere, and with fewer than three views.
 
-    Something is wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
-    where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so).
+    Views disagree where ids are likely to be wrong, where no reprojection error that is tried is large enough, or where
+    some views explain far less than the others (`benchmarks/confidence.py` counts how often something is wrong then).
 
     Args:
-        matching: of "nview"; of other methods nothing is said.
+        matching: of "nview"; there is no finding for other methods.
         names: of the views; (): their indices.
-        is_detected: a detector found the masks in these photos: none is missing or of another photo for the user to
-            mend.
+        is_detected: a detector found the masks in these photos: the user has none to add or to mend.
     """
     report, regions, is_matched = matching.report, matching.masks.regions, matching.instance_ids > 0
     if report.explained is None or report.view_explained is None or regions.num_views < 3 or not len(regions):
@@ -232,11 +228,8 @@ def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detec
 
 
 def odd_views(view_explained: Tensor) -> list[int]:
-    """The views that explain far less than the median of the others does: most likely theirs are the wrong poses.
-
-    `view_explained` (V,) is that of `Matching`; with fewer than four views, or where no view explains anything, there
-    are none.
-    """
+    """The views that explain far less than the median of the others does: most likely their poses are wrong.
+    `view_explained` (V,) is that of `Matching`; none with fewer than four views, or where no view explains anything."""
     if len(view_explained) < DOUBTS.min_views:
         return []
     return (view_explained < DOUBTS.alike * view_explained.nanmedian()).nonzero()[:, 0].tolist()

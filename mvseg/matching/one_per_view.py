@@ -24,27 +24,18 @@ Ints = NDArray[np.int64]
 def one_per_view_clusters(graph: ViewGraph) -> Clusters:
     """Cluster the graph so that no cluster holds two regions of one view, but for regions that links join.
 
-    Average linkage, then sweeps of one assignment problem per view until nothing changes.
-
-    Returns:
-        The clusters, those of one region included. They do not depend on the order of views and regions unless weights
-        tie.
+    Average linkage, then sweeps of one assignment problem per view until nothing changes. Clusters of one region are
+    included. Only where weights tie does the result depend on the order of views and regions.
     """
     return power_iteration(graph, link_average(graph, ONE_PER_VIEW.stop))
 
 
 def link_average(graph: ViewGraph, stop: float) -> Clusters:
-    """Average linkage in which clusters that share a view are never joined, nor those that are apart.
+    """Average linkage in which clusters that share a view, or are apart, are never joined; singletons are included.
 
     Nodes of several regions are joined first: from then on linkage is that of the contracted graph, whose weights are
     means. Of equal weights, that of the regions that come first counts as larger, so that SciPy's order of ties does
-    not show.
-
-    Args:
-        stop: two clusters with a smaller mean weight, or with mean weight 0, are not joined.
-
-    Returns:
-        The clusters, those of one region included.
+    not show. Clusters with a mean weight of 0, or below `stop`, are not joined.
     """
     if len(graph.weights) < 2:
         return Clusters.of(np.arange(len(graph.weights)))
@@ -65,9 +56,6 @@ def power_iteration(graph: ViewGraph, clusters: Clusters) -> Clusters:
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
     alone, for a gain of `ONE_PER_VIEW.alone`. A node of several regions moves as one, whenever a view of it is
     re-assigned; its gains are their sums. The views with the largest total weight come first, whatever their numbers.
-
-    Returns:
-        The clusters, those of one region included.
     """
     order = view_order(graph)
     for _ in range(ONE_PER_VIEW.max_sweeps):
@@ -112,15 +100,8 @@ def join_alone(graph: ViewGraph, clusters: Clusters, *, stop: float) -> Clusters
 
 
 def assign_one_to_one(gain: Floats, alone: float | Floats) -> Ints:
-    """Best assignment of N regions to K clusters: a cluster takes at most one, and any region may stay alone.
-
-    Args:
-        gain: (N, K); -inf: never.
-        alone: gain of a region in a cluster of its own; of all, or of each (N,).
-
-    Returns:
-        (N,) cluster of each region; those alone get K, K + 1, ...
-    """
+    """Assign N regions to K clusters by `gain` (N, K), -inf for never: a cluster takes at most one, and any region may
+    stay alone for a gain of `alone`, one for all or (N,). Returns (N,) clusters; regions alone get K, K + 1, ..."""
     num_regions, num_clusters = gain.shape
     padded = np.full((num_regions, num_clusters + num_regions), np.reshape(alone, (-1, 1)))
     padded[:, :num_clusters] = gain

@@ -20,12 +20,8 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """A partition of D regions into K clusters, made by `of`.
-
-    Attributes:
-        ids: (D,) int64, the cluster of each region in [0, K), numbered in the order of their first members; -1 for a
-            region in none.
-    """
+    """A partition of D regions into K clusters, made by `of`. `ids` (D,) int64 are clusters in [0, K), numbered in the
+    order of their first members; -1 for a region in none."""
 
     ids: Ints
 

@@ -17,24 +17,19 @@ from mvseg.scene import Cameras
 class Pencil:
     """The half-planes through the baseline of cameras i and j.
 
-    Attributes:
-        plane_from_px: (2, 2, 3) float64 on the CPU, for camera i and camera j: (u, v, 1) -> (x, y), the viewing ray of
-            the pixel projected along the baseline. The angle of (x, y) is the angle of the half-plane, equal in both
-            images.
+    `plane_from_px` (2, 2, 3) float64 on the CPU, for camera i and camera j: (u, v, 1) -> (x, y), the viewing ray of the
+    pixel projected along the baseline. The angle of (x, y) is that of the half-plane, equal in both images.
     """
 
     plane_from_px: Tensor
 
     def angles(self, side: int, xy: Tensor) -> Tensor:
-        """Half-plane of each pixel (Eq. 1: pixels of i and j with equal angle lie on each other's epipolar lines).
-
-        Args:
-            side: 0 for camera i, 1 for camera j.
-            xy: (P, 2) pixel positions.
+        """Half-plane of each pixel (P, 2) of camera i (`side` 0) or j (1). By Eq. 1, pixels of i and j with equal angle
+        lie on each other's epipolar lines.
 
         Returns:
-            (P,) float32 in [-2, 2], a monotone stand-in for atan2 that needs one division (the 1-norm angle
-            y / (|x| + |y|), continued over the left half-plane). 0 at an epipole, where no half-plane is defined.
+            (P,) float32 in [-2, 2], a monotone stand-in for atan2 that needs one division (the 1-norm angle y / (|x| +
+            |y|), continued over the left half-plane). 0 at an epipole, where no half-plane is defined.
         """
         x, y = self._plane(side, xy)
         angle = y / x.abs().add_(y.abs()).clamp_(min=torch.finfo(x.dtype).tiny)
@@ -59,12 +54,8 @@ class Pencil:
 def mean_pitches(planes_from_px: Tensor, xy: Tensor) -> list[float]:
     """Mean change of the angle when a pixel moves by one pixel across its epipolar line, in each of Q pencils.
 
-    It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over the pixels; pixels within a pixel of the epipole,
-    where it diverges, count as if one pixel away.
-
-    Args:
-        planes_from_px: (Q, 2, 3), one side of each pencil: see `Pencil.plane_from_px`.
-        xy: (P, 2) pixels of one view.
+    It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over pixels `xy` (P, 2) of one view; pixels within a pixel
+    of the epipole, where it diverges, count as one pixel away. `planes_from_px` (Q, 2, 3) is one side of each pencil.
     """
     planes = planes_from_px.to(xy)[..., None]
     x, y = (planes[:, row, 0] * xy[:, 0] + planes[:, row, 1] * xy[:, 1] + planes[:, row, 2] for row in (0, 1))
@@ -88,14 +79,8 @@ def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:
 
 
 def epipolar_pencils(cameras: Cameras, pairs: Sequence[tuple[int, int]]) -> list[Pencil]:
-    """The pencils of pairs of cameras.
-
-    Any baseline will do: an epipole inside an image or at infinity, or cameras that face each other, need no special
-    treatment.
-
-    Raises:
-        InputError: the cameras of a pair share a centre (no epipolar geometry).
-    """
+    """The pencils of pairs of cameras, with any baseline: an epipole inside an image or at infinity, or cameras that
+    face each other, need no special treatment. Raises InputError: the cameras of a pair share a centre."""
     if not len(pairs):
         return []
     index = torch.tensor(pairs, device=cameras.device)

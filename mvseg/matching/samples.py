@@ -21,7 +21,6 @@ class Samples:
         xy: (P, 2) float32, pixel centres; of a run, that of its first pixel.
         owner: (P,) int64 in [0, N), the region of each.
         weight: (P,) float32, number of mask pixels that each stands for.
-        num_regions: N.
         last_xy: (P, 2) float32, the centre of the last pixel of each run; None: these are pixels.
         length: (P,) int64, number of pixels, or lattice points, of each run.
     """
@@ -57,11 +56,8 @@ class Samples:
 
 
 def view_samples(regions: Regions) -> tuple[list[Samples], list[Tensor]]:
-    """The pixels of the regions, view by view.
-
-    Returns:
-        V `Samples`, and V int64 tensors: the index in `regions` of each region of the view, in the order of `owner`.
-    """
+    """The pixels of the regions, view by view: V `Samples`, and V int64 tensors: the index in `regions` of each region
+    of the view, in the order of `owner`."""
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
     samples = []
     for nodes in members:

@@ -1,8 +1,8 @@
 """Graph clustering by symmetric NMF, and the number of clusters by Eq. 7, as in the paper (Sec. 3.1, 3.4).
 
 The paper does not state the range in which Eq. 7 looks for |k|, and that range decides everything: Eq. 7 is 0 for every
-partition into equal parts, so that k = 1, k = |V| and, where all leaves are seen in all views, any merge into equal
-groups all tie with the truth. The default range here is [max_v n_v, 2 max_v n_v], n_v the number of masks in view v: an
+partition into equal parts, so k = 1, k = |V| and, where all leaves are seen in all views, any merge into equal groups
+all tie with the truth. The default range here is [max_v n_v, 2 max_v n_v], n_v the number of masks in view v: an
 instance has at most one mask per view, so the lower end holds as long as no mask is split.
 """
 
@@ -27,8 +27,8 @@ class Clustering:
     """Instance ids of the regions.
 
     Attributes:
-        instance_ids: (D,) int64 in [1, K], or -1 for a region without an edge. Instances are numbered in the order of
-            their first region; none is empty.
+        instance_ids: (D,) int64 in [1, K], in the order of their first region, none empty; -1 for a region without an
+            edge.
         num_clusters: the |k| of the factorisation; K is smaller where SymNMF left a cluster empty.
         criterion: {k: value of Eq. 7} for each k that was tried.
     """
@@ -102,14 +102,13 @@ def factorise(
     """Symmetric non-negative matrix factorisation W ~ H H^T (Kuang et al. 2012), by multiplicative updates.
 
     All k are factorised together, padded to the widest: the surplus columns of a smaller k start at 0, and a
-    multiplicative update keeps them there.
+    multiplicative update keeps them there. The result for one k does not depend on the others.
 
     Args:
         W: (D, D) symmetric, >= 0.
-        ks: numbers of columns of H; the result for one k does not depend on the others.
-        num_restarts: random starts for each k; the H of the smallest |W - H H^T| is returned.
-        num_iterations: updates of each start.
-        seed: for the starts, which are drawn on the CPU so that they are the same on every device.
+        ks: numbers of columns of H.
+        num_restarts: random starts for each k, drawn on the CPU so that they are the same on every device; the H of the
+            smallest |W - H H^T| is returned.
 
     Returns:
         For each k an H, (D, k) float32 >= 0; the arg max of a row is the cluster of that node.

@@ -1,4 +1,4 @@
-"""The graph that all methods cluster: epipolar weights, the views of the regions, and what the user knows of them."""
+"""The graph that all methods cluster: epipolar weights, the views of the regions, and links of the user."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ class ViewGraph:
     Attributes:
         weights: (D, D) symmetric, >= 0.
         view_index: (D,) int64 in [0, V).
-        num_views: V.
-        links: of the regions: what must stay together and apart.
+        links: regions that must stay together or apart.
     """
 
     weights: Floats
@@ -55,8 +54,7 @@ class ViewGraph:
         return replace(self, links=NO_LINKS) if len(self.links) else self
 
     def sum_partners(self, values: Floats, clusters: Clusters) -> NDArray[np.float64]:
-        """(D,) sums of `values` (D, D) between each region and its partners: the members of its cluster in other
-        views."""
+        """(D,) sums of `values` (D, D) between each region and its partners: its cluster's members in other views."""
         sums = np.zeros(len(clusters.ids))
         for members in clusters.members:
             is_partner = self.view_index[members][:, None] != self.view_index[members]
@@ -84,7 +82,7 @@ class ViewGraph:
 
     @property
     def is_linked(self) -> Bools:
-        """(D,) whether the user says anything of a region."""
+        """(D,) whether a link of the user names the region."""
         return self.is_joined | self.apart.any(1)
 
     def contract(self) -> Floats:
@@ -136,12 +134,8 @@ class ViewGraph:
 
 @dataclass(frozen=True, eq=False)
 class Movers:
-    """N nodes of regions, each of which moves as one.
-
-    Attributes:
-        rows: (R,) int64, their regions.
-        owner: (R,) int64 in [0, N), the node of each.
-    """
+    """N nodes that move as one each: `rows` (R,) int64 are their regions, `owner` (R,) int64 in [0, N) the node of
+    each."""
 
     rows: Ints
     owner: Ints
@@ -164,7 +158,7 @@ class Movers:
 
 
 def first_without_links(graph: ViewGraph, cluster: Callable[[ViewGraph, Clusters | None], Clusters]) -> Clusters:
-    """Partition by a method. Without links, if the partition agrees with all of them: it is the best one under them,
-    too. Otherwise with links; the method then gets the partition without them as its second argument."""
+    """Partition by a method. A partition without links that agrees with all of them is the best one under them, too.
+    Otherwise the method runs with links, and gets the partition without them as its second argument."""
     found = cluster(graph.without_links, None)
     return found if graph.links.agree(found) else cluster(graph, found)

@@ -1,4 +1,4 @@
-"""Which shape an instance gets: a surface where there is a credible one, or else voxels."""
+"""Choice of the shape of an instance: a surface where there is a credible one, or else voxels."""
 
 from __future__ import annotations
 
@@ -33,10 +33,7 @@ def reconstruct_voxels(
 
     Returns:
         {instance id: voxels}: of all instances with "voxels" or "both", of those without a credible surface with
-        "surface". Their crumbs are dropped (`VoxelGrid.without_crumbs`).
-
-    Raises:
-        InputError: see `reconstruct_instances`.
+        "surface". Their crumbs are dropped (`VoxelGrid.without_crumbs`). Raises as `reconstruct_instances` does.
     """
     if config.shape == "surface":
         credible = [instance for instance, surface in (surfaces or {}).items() if surface.is_credible]

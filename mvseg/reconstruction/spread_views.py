@@ -1,7 +1,7 @@
-"""Some of many views, evenly spread by direction around what the cameras look at.
+"""Some of many views, evenly spread by direction around the point that the cameras look at.
 
-They are chosen as electric charges would settle: the sum of 1 / d^2 over all pairs of chosen directions, d their
-distance on the unit sphere, is as small as no single exchange makes it smaller.
+They are chosen as electric charges would settle: no exchange of one view lowers the sum of 1 / d^2 over all pairs of
+chosen directions, d their distance on the unit sphere.
 """
 
 from __future__ import annotations
@@ -18,17 +18,11 @@ from mvseg.scene import Cameras
 
 
 def spread_views(cameras: Cameras, most: int) -> Tensor:
-    """The indices of at most so many views.
+    """The indices (S,) int64, ascending, of at most `most` >= 1 views.
 
-    What the cameras look at is the point nearest to their optical axes; where these are parallel, a point as far ahead
-    as the cameras are apart. Distances from it play no part. The order of the views decides between choices that are
-    equally even, and nothing else.
-
-    Args:
-        most: >= 1; all views are taken where there are no more than that.
-
-    Returns:
-        (S,) int64, ascending.
+    The cameras look at the point nearest to their optical axes; where these are parallel, at a point as far ahead as
+    the cameras are apart. Distances from it play no part. The order of the views only decides between equally even
+    choices.
     """
     return torch.from_numpy(spread_directions(_directions(cameras.to("cpu")), most))
 
@@ -78,7 +72,6 @@ def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
 
 
 def _exchange(crowding: NDArray[np.float64], is_taken: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Spread the views better: make the exchange of two views that helps most, until none helps."""
     is_taken = is_taken.copy()
     while True:
         load = crowding @ is_taken

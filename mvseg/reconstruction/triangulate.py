@@ -16,15 +16,9 @@ Key = TypeVar("Key", bound=Hashable)
 
 
 def triangulate_points(cameras: Cameras, sightings: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
-    """Points that two views or more agree on.
-
-    Args:
-        sightings: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
-
-    Returns:
-        {point: (3,) world coordinates}; points seen in a single view, or not within `RAYS.most_error` in each, are left
-        out, and so are those whose rays are all nearly parallel.
-    """
+    """Points that two views or more agree on, {point: (3,) world coordinates}, from `sightings` {point: (view, (2,)
+    pixels)}, at most once in a view. Points seen in a single view, or not within `RAYS.most_error` in each, are left
+    out, and so are those whose rays are all nearly parallel."""
     centers, sizes = cameras.centers.cpu().numpy(), cameras.sizes.cpu().numpy()
     px_from_world = cameras.px_from_world.cpu().numpy()
     points: dict[Key, Floats] = {}

@@ -1,7 +1,7 @@
 """The space that most masks of an instance allow, as cells of an octree: the visual hull, coarsely.
 
-A cube is halved again and again, and cells that too few masks can show any point of are left out. Cells are judged by
-the balls around them, so nothing is lost, however thin.
+A cube is halved again and again; cells of which too few masks can show any point are dropped. Cells are judged by the
+balls around them, so nothing is lost, however thin.
 """
 
 from __future__ import annotations
@@ -20,12 +20,7 @@ from mvseg.scene import nearest_point
 @dataclass(frozen=True, eq=False)
 class Cells:
     """Cells of a cube: cell (a, b, c) reaches from corner + size * (a, b, c) to corner + size * (a + 1, b + 1, c + 1).
-
-    Attributes:
-        indices: (P, 3) int64.
-        corner: (3,) float64, of the cube, in the world.
-        size: of a cell.
-    """
+    `indices` are (P, 3) int64, `corner` (3,) float64, of the cube, in the world."""
 
     indices: Tensor
     corner: Tensor
@@ -105,18 +100,15 @@ class Silhouettes:
 
     @cached_property
     def _integrals(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Pixels of each mask above and to the left of each pixel corner, row by row and one mask after the other; the
-        first place of each mask (S, 1), and its sides (S, 1, 2): columns and rows."""
+        """Integral images of all masks in one row; first place (S, 1) and columns and rows (S, 1, 2) of each."""
         sums = [torch.nn.functional.pad(mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten() for mask in self.masks]
         first = torch.tensor([0, *(len(each) for each in sums[:-1])]).cumsum(0)
         sides = torch.tensor([(mask.shape[1], mask.shape[0]) for mask in self.masks])
         return torch.cat(sums), first[:, None].to(sums[0].device), sides[:, None].to(sums[0].device)
 
     def may_meet(self, points: Tensor, radius: float) -> Tensor:
-        """(S, P) bool: can a mask meet the projection of a ball about a point (P, 3)?
-
-        The projection is replaced by a square of pixels that contains it, so the answer errs only towards True.
-        """
+        """(S, P) bool: can a mask meet the projection of a ball about a point (P, 3)? The projection is replaced by a
+        square of pixels that contains it, so the answer errs only towards True."""
         cam = points @ self.px_from_world[:, :, :3].mT + self.px_from_world[:, None, :, 3]
         depth, distance = cam[..., 2], torch.linalg.vector_norm(points - self.centers[:, None], dim=2)
         # |u' - u| <= f r sqrt(1 + (X / Z)^2) / (Z - r), and distance / depth is the root, or more.
@@ -137,8 +129,8 @@ class Silhouettes:
 
 
 def halve_cells(silhouettes: Silhouettes, threshold: float) -> Iterator[Cells]:
-    """The cube of the silhouettes in ever smaller cells: of these, those whose points more than this share of the masks
-    may show. Without end; masks of nearly parallel views may share an unbounded space, which ends at the cube."""
+    """The cube of the silhouettes in ever smaller cells, without end: those whose points more than this share of the
+    masks may show. Masks of nearly parallel views may share an unbounded space, which ends at the cube."""
     cells = silhouettes.cube
     while True:
         cells = cells.divide(2)

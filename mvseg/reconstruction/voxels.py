@@ -27,11 +27,11 @@ class VoxelGrid:
     """One instance in 3D.
 
     Attributes:
-        origin: (3,) float64, world position of the corner of voxel (0, 0, 0); voxel (a, b, c) is centred at
-            origin + voxel_size * (a + 0.5, b + 0.5, c + 0.5).
+        origin: (3,) float64, world position of the corner of voxel (0, 0, 0); voxel (a, b, c) is centred at origin +
+            voxel_size * (a + 0.5, b + 0.5, c + 0.5).
         voxel_size: edge length in world units.
-        votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6);
-            0 where `ReconstructConfig.seen_share` forbids the voxel, and in crumbs that were dropped.
+        votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6); 0
+            where `ReconstructConfig.seen_share` forbids the voxel, and in crumbs that were dropped.
         num_views: views that could vote.
         threshold: a voxel is occupied when its share exceeds this.
     """
@@ -59,18 +59,13 @@ class VoxelGrid:
 
     @property
     def num_pieces(self) -> int:
-        """How many pieces the occupied voxels fall into.
-
-        Voxels that share a face are of one piece; those that share only an edge or a corner are not: in the mesh they
-        come apart, as a rule.
-        """
+        """Number of pieces of the occupied voxels. Voxels of one piece share faces; an edge or a corner does not do: in
+        the mesh such voxels come apart, as a rule."""
         return len(self._pieces()[1])
 
     def without_crumbs(self) -> VoxelGrid:
-        """The grid without pieces that have fewer voxels than `VOXELS.crumb` of the largest one.
-
-        Their votes become 0, so that they are gone from points, volume and mesh alike.
-        """
+        """The grid without pieces that have fewer voxels than `VOXELS.crumb` of the largest one: their votes become 0,
+        so that they are gone from points, volume and mesh alike."""
         piece, sizes = self._pieces()
         if not len(sizes) or sizes.min() >= VOXELS.crumb * sizes.max():
             return self
@@ -84,9 +79,7 @@ class VoxelGrid:
 
     def mesh(self) -> trimesh.Trimesh:
         """Closed surface of the occupied voxels (marching cubes between the last free and the first occupied share).
-
-        World coordinates, faces outward; an empty mesh when no voxel is occupied.
-        """
+        World coordinates, faces outward; an empty mesh when no voxel is occupied."""
         if not self.occupied.any():
             return trimesh.Trimesh()
         votes = np.pad(self.votes.cpu().numpy(), 1)
@@ -150,10 +143,8 @@ def back_project(
     get no vote there. The grid is aligned to multiples of the voxel size: grids of one size share their lattice.
 
     Args:
-        members: the masks of the instance.
-        config: threshold, voxel size (world units) or voxel budget.
-        free: view -> (H, W) bool, where it shows no region of any instance, for `config.seen_share`; of every view
-            with a mask. None: no pixel is known to be free, which leaves the paper's rule.
+        free: view -> (H, W) bool, where it shows no region of any instance, for `config.seen_share`; of every view with
+            a mask. None: no pixel is known to be free, which leaves the paper's rule.
 
     Returns:
         The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)
@@ -196,11 +187,7 @@ def back_project(
 def _share_of_masks(
     silhouettes: Silhouettes, axes: list[Tensor], *, free: Silhouettes | None, seen_share: float
 ) -> Tensor:
-    """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory.
-
-    With `free`, what shows nothing in the same views, it is 0 where not more than `seen_share` of the views whose pixel
-    is in the mask or free have it in the mask.
-    """
+    """(X, Y, Z) float32: I_k (Eq. 6), slab by slab; 0 where masks are at most `seen_share` of masks and `free`."""
     slab = max(1, VOXELS.slab // (len(axes[1]) * len(axes[2])))
     parts = []
     for planes in axes[0].split(slab):
@@ -222,11 +209,7 @@ def _count_masks(silhouettes: Silhouettes, axes: list[Tensor]) -> Tensor:
 
 
 def _is_in(mask: Tensor, px_from_world: Tensor, axes: list[Tensor]) -> Tensor:
-    """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask (h, w)?
-
-    Computed relative to the first point, so that float32 is exact to a thousandth of a pixel wherever the world's
-    origin is.
-    """
+    """(X, Y, Z) bool, L of Eq. 6: is the point in front of the camera, and its pixel in the mask (h, w)?"""
     first = torch.stack([axis[0] for axis in axes])
     offset = (px_from_world[:, :3] @ first + px_from_world[:, 3]).float()
     x, y, z = ((axis - axis[0]).float() for axis in axes)
@@ -242,11 +225,7 @@ def _is_in(mask: Tensor, px_from_world: Tensor, axes: list[Tensor]) -> Tensor:
 
 
 def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, Tensor] | None:
-    """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
-
-    Cells are halved until the box of the remaining ones is `VOXELS.search_cells` cells long and hardly shrinks any
-    more. None when no cell is left.
-    """
+    """Corners (3,), (3,) of a box of all points whose share of masks exceeds the threshold; None without any."""
     before = torch.inf
     for cells in halve_cells(silhouettes, threshold):
         if not len(cells):

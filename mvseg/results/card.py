@@ -1,4 +1,4 @@
-"""The card of a result: what was found, what is most in doubt, and the one next step, with a command to paste."""
+"""The card of a result: its outcome, its worst doubt, and the one next step, with a command to paste."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Card:
     Attributes:
         summary: how many leaves, in how many photos.
         doubt: the finding that explains most faults; None where there is none.
-        next_step: what helps most, and the command that does it.
+        next_step: the most helpful step, and the command for it.
     """
 
     summary: str

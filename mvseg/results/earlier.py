@@ -1,4 +1,4 @@
-"""What a command may replace: what mvseg wrote for the same purpose, and nobody has changed since.
+"""Files that a command may replace: those that mvseg wrote for the same purpose, and nobody has changed since.
 
 The run.json of a folder says what it is and what it was made of ("output"), and lists the files that were written with
 it, with their SHA-256 ("files"). Everything else there belongs to the user (edits, notes, the metrics.json of `mvseg
@@ -49,10 +49,8 @@ class Output:
     """Output of a command that is about to write into a folder.
 
     Attributes:
-        kind: of the folder.
-        of: what it is made of: a folder of the same kind that was made of none of these is another one's. (): the place
-            alone says whose it is.
-        reads: what else the command reads.
+        of: inputs; a folder made from other inputs is refused. (): any folder of the kind is accepted.
+        reads: other files and folders that the command reads.
         overwrite: replace another one's folder, too, or one of another kind; None: the command has no such option.
         names: files that the command surely writes: one of the user is refused before the work.
     """
@@ -65,7 +63,7 @@ class Output:
 
     @property
     def run_file(self) -> str:
-        """The file that says what a folder is; that of a scene, which lies in the user's hands, is called apart."""
+        """The file that says what a folder is; that of a scene, which lies in the user's hands, has another name."""
         return POSE_FILE if self.kind == "scene" else RUN_FILE
 
     def describe(self, out: Path) -> dict[str, Any]:
@@ -92,11 +90,9 @@ NOT_OURS = "was not written by mvseg, but the new result has a file of this name
 def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[Path]:
     """A new folder whose files replace those of an earlier one at `out` when the block ends, see `folder_whole`.
 
-    At the end, `run`, as the block left it, is written to the run file with what the folder is and a list of the files.
-
-    Raises:
-        InputError: see `check_out`; or a file of the user has the name of a new one: nothing of `out` is changed, and
-            the new result stays beside it.
+    At the end, `run`, as the block left it, is written to the run file with the folder's purpose and a list of the
+    files. Raises InputError: see `check_out`; or a file of the user has the name of a new one: nothing of `out` is
+    changed, and the new result stays beside it.
     """
 
     def list_replaced(folder: Path) -> set[str]:
@@ -126,9 +122,8 @@ def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[P
 def check_out(out: Path, output: Output = RESULT) -> set[str]:
     """The files in `out` that a command may replace with its output; none if it is new or empty.
 
-    Raises:
-        InputError: nothing can be written there; it holds something else than an earlier output of this kind, made of
-            the same, or a file that was changed since; or the command reads it.
+    Raises InputError: nothing can be written there; it holds something else than an earlier output of this kind, made
+    of the same, or a file that was changed since; or the command reads it.
     """
     place = resolve_place(out)
     _try_place(out, place)
@@ -178,11 +173,8 @@ def claim_folder(out: Path, output: Output) -> None:
 
 def check_file(path: Path, sign: bytes | None) -> None:
     """Check that a command may write a file: there is none, or one that mvseg wrote, which holds `sign` (None: no such
-    file is ours). A link is replaced, and never followed.
-
-    Raises:
-        InputError: there is another file, or a folder; or nothing can be written there.
-    """
+    file is ours). A link is replaced, and never followed. Raises InputError: there is another file, or a folder; or
+    nothing can be written there."""
     _try_place(path, resolve_place(path.parent) / path.name)
     if path.is_symlink() or not path.exists():
         return

@@ -49,8 +49,8 @@ def save_result(
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
 
     Args:
-        run: what goes into run.json besides timings and counts: version, config, inputs, warnings; None: what a result
-            that was loaded knows of its run.
+        run: entries of run.json besides timings and counts: version, config, inputs, warnings; None: those that a
+            loaded result knows of its run.
         output: what may be replaced; by default any result.
 
     Raises:
@@ -78,8 +78,7 @@ def save_result(
 
 
 def describe_result(result: Result) -> dict[str, Any]:
-    """Entries of run.json about the outcome of a run: of the scene, matching, traits and corrections; counts and
-    timings."""
+    """Entries of run.json about the outcome of a run: scene, matching, traits, corrections, counts and timings."""
     report, scene = result.matching.report, result.scene
     shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]
     taken = [view.name for view in scene.views]

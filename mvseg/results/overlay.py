@@ -33,13 +33,8 @@ def instance_color(instance: int) -> tuple[int, int, int]:
 def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     """Tint the masks of one view in the colours of their instances, with contour and number.
 
-    Unmatched ones are grey and have no number; numbers get a question mark where the match score is below 0.5.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB, undistorted.
-
-    Returns:
-        uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
+    Unmatched ones are grey and have no number; numbers get a question mark where the match score is below 0.5. The
+    photo is (H, W, 3) uint8 RGB, undistorted; so is the overlay, scaled down to at most 1600 pixels on its longer side.
     """
     height, width = photo.shape[:2]
     scale = min(1.0, MAX_SIDE / max(height, width))
@@ -73,8 +68,8 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
 
 
 def find_plant(masks: Masks, *, view: int, size: tuple[int, int]) -> Box:
-    """Box (xyxy, pixels) around all matched masks of one view, with a margin, and inside the photo of this width and
-    height, whose proportions it has; the whole photo where nothing is matched."""
+    """Box (xyxy, pixels) around all matched masks of one view, with a margin, inside the photo of this width and height
+    and with its proportions; the whole photo where nothing is matched."""
     regions = masks.regions
     boxes = regions.boxes[(regions.view_index == view) & (masks.instance_ids > 0) & (regions.areas > 0)]
     if not len(boxes):

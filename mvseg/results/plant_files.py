@@ -39,8 +39,7 @@ def write_plant(result: Result, folder: Path) -> None:
     """Write surfaces.npz, voxels.npz, leaves/*.ply, scene.glb and, where traits were measured, traits.csv,
     traits_wide.csv and, where a stem was found, nodes.csv.
 
-    Meshes are of credible surfaces, for other instances of voxels. The voxels of a leaf that has both get a file of
-    their own.
+    Meshes are of credible surfaces, or else of voxels. If a leaf has both, its voxels get their own file.
     """
     if result.surfaces is not None:
         write_surfaces(folder / SURFACES_FILE, result.surfaces)
@@ -70,8 +69,8 @@ def write_plant(result: Result, folder: Path) -> None:
 
 
 def gltf_from_world(scene: Scene) -> NDArray[np.float64]:
-    """(4, 4) that rotates up to +y and east to +x (`level_frame`) if up is known, and scales lengths to metres if the
-    unit is known."""
+    """(4, 4) that rotates up to +y and east to +x (`level_frame`) if up is known, and scales to metres if the unit is
+    known."""
     matrix = np.eye(4)
     if scene.up is not None:
         east, north, up = level_frame(scene.up)
@@ -90,8 +89,7 @@ def describe_world(scene: Scene) -> dict[str, Any]:
 
 
 def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
-    """{name of a leaf's node: its extras}: id, unit, method, quality, and its existing numbers with standard
-    deviations."""
+    """{name of a leaf's node: its extras}: id, unit, method, quality, and its numbers with standard deviations."""
     extras: dict[str, dict[str, Any]] = {}
     if traits is None:
         return extras

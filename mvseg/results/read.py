@@ -1,7 +1,5 @@
-"""A result folder read back: the only reader of one.
-
-What needs trimesh or scikit-image is imported where it is used: a result of ids alone does not need them.
-"""
+"""A result folder read back: the only reader of one. trimesh and scikit-image are imported where they are used: a
+result of ids alone does not need them."""
 
 from __future__ import annotations
 
@@ -108,10 +106,7 @@ def load_learned(folder: Path, run: RunRecord) -> Learned:
 
 def find_result(folder: Path) -> Path:
     """The result folder that a path means: itself, or the only result in it (`mvseg match` writes one per scene).
-
-    Raises:
-        InputError: it holds several results.
-    """
+    Raises InputError: it holds several results."""
     if (folder / "instances.json").is_file() or not folder.is_dir():
         return folder
     inside = sorted(path.parent for path in folder.glob("*/instances.json"))
@@ -126,15 +121,15 @@ def load_result(folder: Path | str) -> Result:
     """The result in a folder that mvseg wrote; neither the scene folder nor the photos are opened.
 
     Numbers are as exact as the files: cameras, surfaces, voxels and masks come back as they were, match scores and
-    probabilities with four decimals, traits with six digits. What only the run and `mvseg correct` need is not read:
-    `starts` of the instances, the candidates `left` out, and what was known `before_edits`. `Scene.views` name the
-    photos where they are now, if they moved together with the result.
+    probabilities with four decimals, traits with six digits. Data for the run and `mvseg correct` only is not read:
+    `starts` of the instances, the candidates `left` out, and `before_edits`. `Scene.views` name the photos where they
+    are now, if they moved together with the result.
 
     Args:
         folder: of one scene, as `mvseg infer`, `mvseg match` and `mvseg batch` write it.
 
     Returns:
-        The result, on the CPU; `Result.run` is what its run.json says.
+        The result, on the CPU; `Result.run` holds its run.json.
 
     Raises:
         InputError: this is no result; it has another format than this version reads; a file is missing, broken, or
@@ -172,11 +167,8 @@ def load_result(folder: Path | str) -> Result:
 
 
 def check_unchanged(folder: Path, run: RunRecord) -> None:
-    """Check that the files of a result that programs read are those that its run wrote.
-
-    Raises:
-        InputError: one is another result's, or was changed, or cut.
-    """
+    """Check that the files of a result that programs read are those that its run wrote. Raises InputError: one is
+    another result's, or was changed, or cut."""
     for name in READ_FILES:
         path = folder / name
         if name in run.files and path.is_file() and hash_files(path) != run.files[name]:
@@ -331,11 +323,7 @@ def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: 
 
 
 def _find_file(folder: Path, run: RunRecord, name: str) -> Path | None:
-    """A file of the folder; None where the run wrote none.
-
-    Raises:
-        InputError: run.json lists it, and it is gone.
-    """
+    """A file of the folder; None where the run wrote none. Raises InputError: run.json lists it, and it is gone."""
     if (folder / name).is_file():
         return folder / name
     if name in run.files:

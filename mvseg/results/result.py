@@ -27,14 +27,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """The other table: what is known of the instances that `Masks` names. (Their support follows from the masks, see
-    `Matching.support`.)
+    """The table of the instances that `Masks` names. (Their support follows from the masks, see `Matching.support`.)
 
     Attributes:
         probabilities: {instance id: P} of leaves that the views chose.
         starts: {instance id: surface} that they were chosen by, and the final ones are fitted from.
-        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
-            requested.
+        surfaces: {instance id: surface}, some perhaps not credible (`is_credible`); None if not requested.
         voxels: {instance id: voxels}: of all instances if voxels were requested, otherwise of those without a credible
             surface; None for ids only.
         traits: of the plant and its leaves, once ids are final; None for ids only.
@@ -76,11 +74,9 @@ class Learned:
     """Outcome of teaching the detector by the views, see `mvseg.pipeline.learn`.
 
     Attributes:
-        weights: content of the file of the weights that found the leaves, if they were learned here; None: they were
-            not.
+        weights: content of the file of the weights that found the leaves, if they were learned here; else None.
         rounds: that they took.
-        agreed_area: pixels, before learning and after each round that was tried, see `rate_pass`; () where masks were
-            given.
+        agreed_area: pixels, before learning and after each round, see `rate_pass`; () where masks were given.
     """
 
     weights: bytes | None = None
@@ -97,20 +93,19 @@ class Result:
 
     Attributes:
         scene: the scene with the views that were taken.
-        matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
+        matching: the table of its masks, undistorted, with their ids; and a report on the scene.
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
         rejected: candidates that the views did not choose, the most likely leaf first.
-        findings: what the run noticed of its input and of the result, the gravest first.
+        findings: of the run, on its input and the result, the gravest first.
         seconds: {stage: wall time}.
-        mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
-        num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
-            check.
+        mask_kind: source of the masks ("COCO", "label images", ...); "" where a detector found them.
+        num_moved: number of masks that surfaces moved to another instance, see `check_ids`; None without it.
         views_left_out: names of the scene's other views, see `RunConfig.views`.
         corrections: of the user; None where there were none.
         fates: the outcome of each of them.
         learned: by the detector from this scene.
-        before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_plant`); None: nothing is kept.
+        before_edits: the plant before any edit, as `mvseg correct` opens it (`pack_plant`); None: nothing is kept.
         inputs: {path: SHA-256} of the cameras, masks, weights and corrections, as the run read them.
         run: that made a result which was loaded from its folder; None before it was saved.
     """
@@ -133,7 +128,6 @@ class Result:
     run: RunRecord | None = None
 
     def __repr__(self) -> str:
-        """A line for each table."""
         surfaces = () if self.surfaces is None else self.surfaces.values()
         rows = 0 if self.traits is None else len(self.traits.leaves)
         lines = [
@@ -156,15 +150,12 @@ class Result:
 
     @property
     def surfaces(self) -> Mapping[int, LeafSurface] | None:
-        """See `Instances`."""
         return self.instances.surfaces
 
     @property
     def voxels(self) -> Mapping[int, VoxelGrid] | None:
-        """See `Instances`."""
         return self.instances.voxels
 
     @property
     def traits(self) -> Traits | None:
-        """See `Instances`."""
         return self.instances.traits

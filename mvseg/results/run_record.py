@@ -1,4 +1,4 @@
-"""What a result says of the run that made it: run.json."""
+"""run.json of a result: the record of the run that made it."""
 
 from __future__ import annotations
 
@@ -53,8 +53,7 @@ class LearnedRecord(_Part):
 
 
 class RunRecord(_Part):
-    """Record of the run that made a result. Attributes are the fields of run.json, see docs/results.md; further fields
-    of the file are kept, too."""
+    """Record of the run that made a result. Fields of run.json, see docs/results.md; others are kept."""
 
     format: int = Field(1, ge=1)
     mvseg: str = ""
@@ -94,11 +93,7 @@ class RunRecord(_Part):
 
 
 def load_run(folder: Path) -> RunRecord:
-    """The run that made a result.
-
-    Raises:
-        InputError: this is no result, or one of a newer format; run.json is broken.
-    """
+    """The run that made a result. Raises InputError: no result, a newer format, or a broken run.json."""
     wait_until_whole(folder)
     path = folder / RUN_FILE
     if not path.is_file():
@@ -112,8 +107,8 @@ def load_run(folder: Path) -> RunRecord:
 
 
 def find_place(folder: Path, run: RunRecord, stated: Path) -> Path:
-    """Find a file or folder that the run of a result names: where it was, or at the same place as seen from the
-    result, since they may have moved together; where it was, if it is nowhere."""
+    """Find a file or folder that the run of a result names: where it was, or at the same place as seen from the result,
+    since they may have moved together; where it was, if it is nowhere."""
     from_here = run.config.get("from_here")
     if stated.exists() or not isinstance(from_here, dict):
         return stated

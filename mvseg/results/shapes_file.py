@@ -1,7 +1,7 @@
 """Shapes as arrays: surfaces.npz and voxels.npz hold them exactly, for programs that read a result.
 
-Nothing is pickled. Arrays of several leaves are stacked in the order of their ids; what has another length for each
-leaf stands one after another, and an array `num_...` says how many are whose.
+Nothing is pickled. Arrays of several leaves are stacked in the order of their ids; arrays of other lengths for each
+leaf stand one after another, and an array `num_...` holds these lengths.
 """
 
 from __future__ import annotations
@@ -49,11 +49,8 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
 
 
 def read_surfaces(path: Path) -> dict[int, LeafSurface]:
-    """{instance id: surface} of a file that `write_surfaces` wrote.
-
-    Raises:
-        InputError: it is none; or coefficients are no numbers, and no reason says why there is no surface.
-    """
+    """{instance id: surface} of a file that `write_surfaces` wrote. Raises InputError: it is none; or coefficients are
+    no numbers, and no reason says why there is no surface."""
     arrays = _read(path)
     try:
         views, residuals, ious = (_split(arrays[name], arrays["num_views"]) for name in ("views", "residual_px", "iou"))
@@ -101,11 +98,7 @@ def write_voxels(path: Path, voxels: Mapping[int, VoxelGrid]) -> None:
 
 
 def read_voxels(path: Path) -> dict[int, VoxelGrid]:
-    """{instance id: voxels} of a file that `write_voxels` wrote.
-
-    Raises:
-        InputError: it is none.
-    """
+    """{instance id: voxels} of a file that `write_voxels` wrote. Raises InputError: it is none."""
     arrays = _read(path)
     try:
         if not (np.isfinite(arrays["origin"]).all() and np.isfinite(arrays["voxel_size"]).all()):

@@ -35,7 +35,6 @@ class StemPart:
     color: tuple[int, int, int]
 
     def mesh(self) -> trimesh.Trimesh:
-        """A closed tube."""
         return sweep_circle(self.points, self.radius)
 
 

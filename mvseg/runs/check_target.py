@@ -1,6 +1,5 @@
-"""How good a whole chain is, by the photographed page of `mvseg.formats.target`: its shapes are cut out by their colour
-and measured as leaves are, and compared with their true areas.
-"""
+"""Accuracy of a whole chain, by the photographed page of `mvseg.formats.target`: its shapes are cut out by their
+colour, measured as leaves are, and compared with their true areas."""
 
 from __future__ import annotations
 
@@ -50,8 +49,8 @@ class MeasuredShape:
         true_area: as printed, mm^2.
         area, sd: as measured, mm^2; NaN if it was not.
         num_views: how many of its masks were measured together.
-        num_masks: how many masks of it there are, one in each photo that shows it whole.
-        method: what it was measured on, or why it was not.
+        num_masks: its masks, one in each photo that shows it whole.
+        method: measured on which shape, or why it was not.
     """
 
     name: str
@@ -78,7 +77,6 @@ class TargetCheck:
     """Verdict of the photographed page on a chain.
 
     Attributes:
-        shapes: all that are on the page.
         num_tags: tags of which a corner is seen in two photos or more.
         scale: lengths of the scene over those of the print, by the tags.
         residual: of the tags' corners from where they are on the print, root mean square, mm.
@@ -125,11 +123,11 @@ class TargetCheck:
 def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     """Measure the shapes of the photographed page with the stages of `mvseg infer`.
 
-    Where shapes are on the photos, and which mask shows which, follows from the tags; masks and areas do not.
+    The tags tell where shapes are on the photos, and which mask shows which; masks and areas do not.
 
     Args:
         folder: scene with photos of the page; its cameras state the unit of their lengths.
-        bar: length of the printed scale bar, by a ruler, mm: what tags and areas are multiplied with.
+        bar: length of the printed scale bar, by a ruler, mm: a factor of tags and areas.
 
     Raises:
         InputError: bad scene; the unit is not known; no tag is seen in two photos; a photo shows no whole shape.
@@ -183,11 +181,7 @@ def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
 def _cut_view(
     photos: Photos, view: int, *, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d
 ) -> NDArray[np.uint16]:
-    """(H, W) masks of the shapes that are whole in a photo, as the photo has them: with its lens distortion.
-
-    Raises:
-        InputError: none is there.
-    """
+    """(H, W) masks of the shapes whole in a photo, with its lens distortion. Raises InputError: none is there."""
     scene = photos.scene
     camera, size, places = scene.cameras[[view]], scene.cameras.sizes[view].numpy(), {}
     for label, shape in shapes.items():

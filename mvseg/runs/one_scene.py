@@ -33,12 +33,7 @@ from mvseg.system.say import say
 
 @dataclass(frozen=True, eq=False)
 class Solved:
-    """The result of a scene, with what there is to say of it.
-
-    Attributes:
-        result: of the run.
-        card: the last lines of the run.
-    """
+    """The result of a scene, and the card: the last lines of the run."""
 
     result: Result
     card: Card
@@ -47,9 +42,8 @@ class Solved:
 def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
 
-    Raises:
-        InputError: bad input; corrections of another scene, unless they are forced; `out` holds what may not be
-            overwritten; it is read by this run; or another run detects for `out` now.
+    Raises InputError: bad input; corrections of another scene, unless they are forced; `out` holds what may not be
+    overwritten; it is read by this run; or another run detects for `out` now.
     """
     out = request.out
     place = resolve_place(out)
@@ -134,7 +128,7 @@ def save_scene(solved: Solved, request: RunRequest, output: Output) -> None:
 
 def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[str, Any]:
     """Origin of a result, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
-    detector's weights, too), and the options of the stages that ran; and the findings."""
+    detector's weights, too), the options of the stages that ran, and the findings."""
     return {
         **made_by(),
         "torch": torch.__version__,

@@ -54,9 +54,8 @@ def pose_photos(
         up: the direction of up in the known world, or how to find it.
 
     Raises:
-        InputError: a photo or the video is broken, the video shows too little motion, too few photos register, what is
-            known does not fit them or names a unit of no length, or `out` holds something other than an earlier scene
-            of these photos.
+        InputError: a photo or the video is broken, the video shows too little motion, too few photos register, world
+            facts do not fit them or name a unit of no length, or `out` holds something else.
     """
     if world.unit and not world.scales:  # the lengths of the world would get it, and are arbitrary
         raise InputError(f"unit is {world.unit}, and no length is known: expected --marker, --distance, ... with it")
@@ -115,11 +114,8 @@ def _lens_findings(report: LensReport, photos: Sequence[PhotoFile]) -> list[Find
 
 
 def check_folders(photos: Path, out: Path, output: Output) -> tuple[Path, list[str]]:
-    """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written.
-
-    Raises:
-        InputError: no photos, photos inside `out`, or `out` holds something other than a scene of these photos.
-    """
+    """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written. Raises
+    InputError: no photos, photos inside `out`, or `out` holds something other than a scene of these photos."""
     check_place(out, output)
     source, names = list_photos(photos)
     if out.resolve() in (source.resolve(), *source.resolve().parents):
@@ -128,11 +124,8 @@ def check_folders(photos: Path, out: Path, output: Output) -> tuple[Path, list[s
 
 
 def check_place(out: Path, output: Output) -> None:
-    """Check that a scene may be written to `out`, after taking away what a killed run left beside it.
-
-    Raises:
-        InputError: `out` holds something other than an earlier scene of these photos.
-    """
+    """Check that a scene may be written to `out`, after taking away leftovers of a killed run beside it. Raises
+    InputError: `out` holds something other than an earlier scene of these photos."""
     sweep_abandoned(out)
     check_out(out, output)
 
@@ -140,8 +133,7 @@ def check_place(out: Path, output: Output) -> None:
 def _find_structure_of_clip(
     clip: Path, folder: Path, *, config: PoseConfig, calibration: Calibration | None
 ) -> tuple[list[PhotoFile], Structure]:
-    """Choose frames of a video as photos of a scene folder, and estimate their cameras. Where too few register
-    (`STRUCTURE.enough`), frames from the gaps beside the others join the photos, until there are no more."""
+    """Choose frames of a video as photos, and estimate their cameras; frames from gaps join while too few register."""
     footage = watch(clip)
     chosen = choose_frames(footage, most=config.frames)
     check_motion(clip, footage, chosen)

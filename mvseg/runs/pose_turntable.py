@@ -39,17 +39,15 @@ Angles = Path | float | None
 def pose_board_photos(
     photos: Path, out: Path, *, board: BoardConfig, unit: str = "", calibration: Path | None = None
 ) -> Scene:
-    """Calibrate a turntable from photos of a board on it, and write a scene folder with a `turntable.json`.
+    """Calibrate a turntable from photos of a board on it, and write a scene folder with a `turntable.json`. Warns
+    (InputWarning) of a focal length that the photos leave uncertain.
 
     Args:
         photos: folder of photos that one camera took from one place; or of one folder for each camera, with photos at
             the same angles in the same order.
         out: the scene folder; an earlier one is replaced, files of the user in it stay.
         board: what is printed; its lengths are in `unit`.
-        calibration: file of OpenCV or ROS with the camera matrix and distortion of all cameras, which are then not
-            estimated.
-
-    Warns (InputWarning) of a focal length that the photos leave uncertain.
+        calibration: file of OpenCV or ROS with the matrix and distortion of all cameras, which are then not estimated.
 
     Raises:
         InputError: see `calibrate_turntable`; the calibration is of another size or a lens that a turntable file cannot
@@ -101,11 +99,10 @@ def pose_board_photos(
 
 
 def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: Angles = None) -> Scene:
-    """The scene folder of photos from a turntable that was calibrated before.
+    """The scene folder of photos from a turntable that was calibrated before; `photos` and `out` are those of
+    `pose_board_photos`, folders of cameras named as in the calibration.
 
     Args:
-        photos: folder of photos, or of one folder for each camera, named as in the calibration.
-        out: the scene folder, as above.
         angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
             of the file, which then has as many views of each camera as there are photos.
 
@@ -179,7 +176,6 @@ def _angles_of(
 
 
 def _given_lens(given: Calibration, files: Sequence[PhotoFile]) -> TableCamera:
-    """The calibrated lens of all photos, in a camera without a pose."""
     lens = np.append(given.distortion, np.zeros(max(0, 5 - len(given.distortion))))
     if given.is_fisheye or len(lens) > 5 or given.K[0, 1]:
         raise InputError("expected K without skew and k1, k2, p1, p2, k3, which a turntable file can hold")

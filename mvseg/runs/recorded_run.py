@@ -1,4 +1,4 @@
-"""What a result folder says of the run that made it, so that the run can be repeated."""
+"""Read the inputs and options of a run from its result, to repeat it."""
 
 from __future__ import annotations
 
@@ -35,13 +35,9 @@ MOST_BYTES = 1 << 34  # limit: of an input that is compared: run.json may name a
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """The run that made a result.
+    """The run that made a result, with the options of its stages.
 
     Attributes:
-        folder: of the result.
-        record: all that its run.json says.
-        config: the options of its stages.
-        scene: folder of the scene.
         masks: that were given; None: a detector found them.
         corrections: file of the user's edits; None without any.
         changes: inputs that are other ones now, another version of mvseg, and options that this version no longer has.
@@ -60,9 +56,7 @@ def read_recorded(folder: Path) -> RecordedRun:
     """The run that made a result; its inputs are looked for where they were, and then at the same place as seen from
     the result: so they may have moved together.
 
-    Raises:
-        InputError: this is no result, or one with options that this version does not have; its scene or its masks are
-            gone.
+    Raises InputError: this is no result, or one with options that this version lacks; its scene or masks are gone.
     """
     record = load_run(folder)
     scene, masks, corrections = (

@@ -1,4 +1,4 @@
-"""What is asked of a run: the command line, a batch and `--again` make one request each."""
+"""Requests of runs: the command line, a batch and `--again` make one each."""
 
 from __future__ import annotations
 
@@ -20,10 +20,7 @@ class RunRequest:
     """One scene, from its folder to its result folder.
 
     Attributes:
-        scene: folder of the scene.
         masks: file or folder; None: a detector finds them.
-        out: folder of the result.
-        config: the options of all stages.
         corrections: file of the user's edits; None without any.
         force_corrections: apply them even if they were made for other photos.
         overwrite: replace another scene's result, output of another command, or detected masks in `out`.
@@ -59,17 +56,15 @@ def repeat_run(
     detector: Path | None = None,
     corrections: Path | None = None,
 ) -> RunRequest:
-    """The request that made a result, once more, with its options; stderr says what has changed since.
+    """The request that made a result, once more, with its options; stderr says what has changed since. Raises
+    InputError: see `read_recorded`.
 
     Args:
         out: where the new one goes; None: in its place.
-        learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: what the run has learned
-            before is used.
+        learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: the weights learned before
+            are used.
         detector: file of weights that have learned this scene; None: that of the result, if it has one.
         corrections: file of the user's edits; None: that of the run, if it had one.
-
-    Raises:
-        InputError: see `read_recorded`.
     """
     run = read_recorded(folder)
     for change in run.changes:
@@ -89,13 +84,8 @@ def repeat_run(
 
 
 def find_given(scene: Path, given: Path, beside: Path = Path(), *, what: str = "masks") -> Path:
-    """Find masks, or `what` else is given with a scene.
-
-    A relative path may start at the scene folder or at `beside`, as long as only one of the two exists.
-
-    Raises:
-        InputError: both exist, or neither.
-    """
+    """Find masks, or `what` else is given with a scene. A relative path may start at the scene folder or at `beside`,
+    as long as only one of the two exists. Raises InputError: both exist, or neither."""
     inside, outside = scene / given, beside / given
     if inside.exists() and outside.exists() and not inside.samefile(outside):
         raise InputError(f"both {inside} and {outside.resolve()} exist, expected --{what} with the full path of one")

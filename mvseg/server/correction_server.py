@@ -1,4 +1,4 @@
-"""What the user corrects in a page: each edit is saved at once, and its consequences are computed and shown."""
+"""Corrections of the user in a page: each edit is saved at once, and its consequences are computed and shown."""
 
 from __future__ import annotations
 
@@ -41,13 +41,8 @@ def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int,
 
 
 class OpenFolder(Protocol):
-    """A folder that the user corrects: a result, or tracks.
-
-    Attributes:
-        folder: holds `CORRECTIONS_FILE`.
-        learner: of a result that a detector found.
-        answers: {place: what else the page asks there}, by the body of a request.
-    """
+    """A folder that the user corrects: a result, or tracks; it holds `CORRECTIONS_FILE`. `learner` is of a result that
+    a detector found; `answers` {place: what else the page asks there} take the body of a request."""
 
     folder: Path
 
@@ -93,7 +88,7 @@ class Learner(Protocol):
 
 @dataclass(frozen=True)
 class Update:
-    """Consequences of edits: the news for the page, what hinders each edit ("" for nothing), and warnings."""
+    """Consequences of edits: the news for the page, the problem of each edit ("" for none), and warnings."""
 
     news: dict[str, Any] | None
     outcomes: list[str]
@@ -135,13 +130,7 @@ Task = Idle | Computing | Learning | Closed
 
 @dataclass(frozen=True)
 class PageState:
-    """The newest result on the page.
-
-    Attributes:
-        update: it, see `Update`.
-        problem: a sentence about it; "" for none.
-        number: of the news that brought it.
-    """
+    """The newest result on the page, a sentence about its `problem` ("" for none), and the number of its news."""
 
     update: Update
     problem: str = ""
@@ -152,15 +141,8 @@ class Corrector(Generic[Kind]):
     """An open folder, its newest edits, and a thread that computes their consequences; the newest edits win.
 
     The same thread lets the detector learn: what is edited meanwhile is saved, and computed afterwards. `news` is the
-    lock of all attributes, and wakes who waits.
-
-    Attributes:
-        opened: the folder.
-        edits: its edits.
-        task: of the thread.
-        page_state: on the page.
-        making: how far the whole result is, which another thread makes; None: it is not made.
-        number: of all news.
+    lock of all attributes, and wakes who waits; `number` counts all news. `making` says how far the whole result is,
+    which another thread makes; None: it is not made.
     """
 
     def __init__(self, opened: Kind) -> None:
@@ -173,8 +155,7 @@ class Corrector(Generic[Kind]):
         self.making: str | None = None
 
     def page(self) -> bytes:
-        """The page with the newest result, and with all edits that were saved: a reload must not lose any; nor those
-        that another program has written to the file since."""
+        """The page with the newest result, and all saved edits, also those of another program."""
         with self.news:
             try:
                 if self.edits.take_changes(self.opened.read_edits):
@@ -272,8 +253,7 @@ class Corrector(Generic[Kind]):
         publish(Update(self.page_state.update.news, [""] * len(corrections.edits), []), problem)
 
     def _compute_anew(self) -> None:
-        """Ask for the consequences of the edits; the caller holds the lock. If the detector learns, they come
-        afterwards."""
+        """Ask for the consequences of the edits, after learning if the detector learns; the caller holds the lock."""
         wanted = Computing(next(self._numbers))
         if isinstance(self.task, Learning):
             self.task = replace(self.task, then=wanted)
@@ -322,11 +302,8 @@ class Corrector(Generic[Kind]):
 
     def learn(self) -> dict[str, Any]:
         """Let the detector learn the leaves that the views agree about, and those that the user outlined, see
-        `OpenResult.learn`; `state` says how far it is.
-
-        Raises:
-            Refused: there is no detector; it learns already, or the whole result is being made.
-        """
+        `OpenResult.learn`; `state` says how far it is. Raises Refused: there is no detector; it learns already, or the
+        whole result is being made."""
         with self.news:
             self._learner()
             self._refuse_while_learning()
@@ -345,11 +322,7 @@ class Corrector(Generic[Kind]):
         return {}
 
     def unlearn(self) -> dict[str, Any]:
-        """Go back to the detector before it learned.
-
-        Raises:
-            Refused: there is no detector; it learns.
-        """
+        """Go back to the detector before it learned. Raises Refused: there is no detector; it learns."""
         with self.news:
             self._refuse_while_learning()
             if (learner := self._learner()).is_learned:
@@ -363,8 +336,8 @@ class Corrector(Generic[Kind]):
             raise Refused(HTTPStatus.CONFLICT, "The detector is learning: wait until it is done, or cancel it.")
 
     def whole(self) -> dict[str, Any]:
-        """Make the whole result with the saved edits, and with what was learned, in its place, by a process of its own;
-        `state` says how far it is. Then the page is that of the new result.
+        """Make the whole result with the saved edits, and with the learned weights, in its place, by a process of its
+        own; `state` says how far it is. Then the page is that of the new result.
 
         Raises:
             Refused: it is being made already, or the detector learns.

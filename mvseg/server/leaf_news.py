@@ -1,4 +1,4 @@
-"""News of leaves after an edit: those that went without being named, and what came of outlines."""
+"""News of leaves after an edit: those that went without being named, and the outcome of outlines."""
 
 from __future__ import annotations
 
@@ -19,13 +19,8 @@ PARTNERS = 20, 60  # chosen: degrees between two photos that both show a leaf, a
 
 
 def tell_vanished(before: Result, after: Result, *, new: Sequence[Edit]) -> list[str]:
-    """A sentence for each leaf that is gone, though no new edit names one of its masks.
-
-    Args:
-        before: with the numbers of leaves that the page shows.
-        after: the same scene with the new edits, too; leaves keep their numbers.
-        new: edits that `before` was made without; without any, nothing is said: what was undone may go.
-    """
+    """A sentence for each leaf of `before`, with the numbers on the page, that is gone in `after`, the same scene with
+    the `new` edits, too, though none of them names one of its masks. None without new edits: undone leaves may go."""
     old, masks = before.masks.to("cpu"), after.masks.to("cpu")
     gone = sorted(set(old.instance_ids[old.instance_ids > 0].tolist()) - set(masks.instance_ids.tolist()))
     sentences = []
@@ -37,12 +32,8 @@ def tell_vanished(before: Result, after: Result, *, new: Sequence[Edit]) -> list
 
 
 def tell_drawn(result: Result, *, new: Sequence[Edit], angles: NDArray[np.int64]) -> list[str]:
-    """A sentence for each leaf of new outlines: in how many other photos it was found, or why it was not.
-
-    Args:
-        new: edits, of which outlines count.
-        angles: (V, V) degrees between the photos, see `measure_angles`.
-    """
+    """A sentence for each leaf of new outlines: in how many other photos it was found, or why it was not. `angles` (V,
+    V) are degrees between the photos, see `measure_angles`."""
     masks, views = result.masks.to("cpu"), {view.name: index for index, view in enumerate(result.scene.views)}
     drawn = {views[edit.view] for edit in new if isinstance(edit, Outline) and edit.view in views}
     is_drawn = masks.origin == int(Origin.CORRECTED)

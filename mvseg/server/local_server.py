@@ -26,12 +26,7 @@ HOST = "127.0.0.1"
 
 
 class CorrectionServer(ThreadingHTTPServer):
-    """Serves one `Corrector` on a free port of this machine.
-
-    Attributes:
-        token: part of every address that is answered.
-        address: of the page.
-    """
+    """Serves one `Corrector` on a free port of this machine; the `token` is part of every address that is answered."""
 
     daemon_threads = True
 
@@ -94,11 +89,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _place(self) -> str:
-        """The requested path, below the token.
-
-        Raises:
-            Refused: by another name of this machine, from another page, without the token, or no address at all.
-        """
+        """The path below the token. Raises Refused: another name, origin or token, or no address at all."""
         own = f"{HOST}:{self.server.server_port}"
         origin = self.headers.get("Origin")
         if self.headers.get("Host") != own or (origin is not None and origin != f"http://{own}"):

@@ -61,22 +61,11 @@ class _Rough(BaseModel):
 
 
 class OpenResult:
-    """A result folder with its scene.
-
-    Attributes:
-        folder: of the result.
-        run: that made it.
-        notice: what the user should know of it; "" for nothing.
-        opened: its scene, and its masks if they were given.
-    """
+    """A result folder with its scene, and its masks if they were given. `notice` is for the user; "" for nothing."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the scene, and its masks if they were given.
-
-        Raises:
-            InputError: this is no result, or one that this version does not understand; its scene, its masks or its
-                photos are gone.
-        """
+        """Read the scene, and its masks if they were given. Raises InputError: this is no result, or one that this
+        version does not understand; its scene, its masks or its photos are gone."""
         self.folder = folder
         self.run = read_recorded(folder)
         self._detector = _read_detector(folder)
@@ -117,7 +106,6 @@ class OpenResult:
         return len(self.scene.views)
 
     def read_edits(self) -> tuple[Corrections, str]:
-        """The edits in the folder, and what the user should know of them."""
         found = self.saved_corrections()
         with collect_warnings() as noticed:
             check_made_for(found, self.photos)
@@ -128,13 +116,11 @@ class OpenResult:
         return with_marks(corrections, self.scene, self.marks)
 
     def page(self, corrections: Corrections) -> str:
-        """The page with the newest result, and with all edits."""
         shown, pictures = self._page_result
         shown = replace(shown, corrections=corrections)
         return build_page(shown, pictures, run=self.run.record.as_json(), is_served=True)
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
-        """Compute the consequences of edits, see `recompute`."""
         result, outcomes, messages = self.recompute(corrections, is_old)
         made_with = () if self._saved.corrections is None else self._saved.corrections.edits
         if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
@@ -183,17 +169,12 @@ class OpenResult:
         return keep_numbers(replace(saved, scene=self.scene, photos=self.photos), self._numbers)
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
-        """The result with these corrections, without traits and voxels; the problem of each edit, "" for none; and
-        sentences of the findings that the run did not report: those that it did are on the page. Findings are compared
-        by code, as edits change their values. Leaves keep their numbers from one result to the next, see
-        `keep_numbers`.
+        """The result with these corrections, without traits and voxels, bit for bit that of `mvseg infer --again`:
+        earlier fits are taken where they would be fitted to the same. Also the problem of each edit, "" for none, and
+        sentences of the findings that the run did not report. Findings are compared by code, as edits change their
+        values. Leaves keep their numbers from one result to the next, see `keep_numbers`.
 
-        The result is that of `mvseg infer --again`, bit for bit: what was fitted before is taken where it would be
-        fitted to the same.
-
-        Raises:
-            Cancelled: `is_old`, which is asked between the stages, said so.
-            InputError: see the stages.
+        Raises Cancelled: `is_old`, which is asked between the stages, said so; InputError: see the stages.
         """
         plant, noticed = self._now
         with running(is_cancelled=is_old), collect_warnings() as more:
@@ -205,15 +186,10 @@ class OpenResult:
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]
 
     def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:
-        """Let the detector learn the leaves that the views agree about, and those that the user outlined, in one round;
-        `learned` is what is known then, and None undoes it. Each time begins with the weights of the run.
+        """Let the detector learn the leaves that the views agree about, and those that the user outlined, in one round
+        that begins with the weights of the run; `learned` is the outcome, and None undoes it.
 
-        Args:
-            is_old: whether nobody wants it any more; asked at every step.
-
-        Raises:
-            Cancelled: `is_old` said so.
-            InputError: masks were given, so there is no detector.
+        Raises Cancelled: `is_old`, asked at every step, said so; InputError: masks were given: no detector.
         """
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
@@ -229,8 +205,8 @@ class OpenResult:
         self.learned = None
 
     def again(self, place: Path) -> list[str]:
-        """`mvseg infer --again`, with options by which the whole result is found by the detector of the page,
-        whichever lies in the folder by now; its weights are written into the folder `place`."""
+        """`mvseg infer --again`, with options by which the detector of the page finds the whole result, whichever lies
+        in the folder by now; its weights are written into the folder `place`."""
         return ["infer", "--again", str(self.folder.resolve()), *self._again_with(place)]
 
     def reopened(self) -> OpenResult:
@@ -247,11 +223,8 @@ class OpenResult:
         return ["--detector", str(place / DETECTOR_FILE)]
 
     def outline(self, text: bytes) -> dict[str, Any]:
-        """Refine a rough outline, both in pixels of the user's photo.
-
-        Raises:
-            InputError: a request of another form, no such view, or nothing to outline.
-        """
+        """Refine a rough outline, both in pixels of the user's photo. Raises InputError: a request of another form, no
+        such view, or nothing to outline."""
         scene = self.scene
         try:
             asked = _Rough.model_validate_json(text)
@@ -274,7 +247,6 @@ class OpenResult:
 
     @cached_property
     def _plant_before(self) -> tuple[Plant, list[Finding]]:
-        """The plant before edits, and the findings on the way; found once."""
         before = None if (content := self._before_edits()) is None else unpack_plant(content, self.opened)
         if before is not None:
             return before
@@ -311,7 +283,6 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
     ids may have gaps.
 
     Args:
-        result: with ids of its own.
         number_of: {name of a mask: number of its leaf}; learns those of the result.
         previous: masks that the page shows, with their numbers: a mask without a known name, as a detector that has
             learned finds it, votes for the leaf of the mask that it covers (`EVIDENCE.fits`). None: there are none.
@@ -344,11 +315,8 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
 
 @contextmanager
 def open_alone(folder: Path) -> Iterator[None]:
-    """Keep a second process from correcting the same result; the lock ends with this process, however it ends.
-
-    Raises:
-        InputError: another one has it open.
-    """
+    """Keep a second process from correcting the same result; the lock ends with this process, however it ends. Raises
+    InputError: another one has it open."""
     with ExitStack() as stack:
         try:
             stack.enter_context(lock_folder(folder))

@@ -30,24 +30,14 @@ class _TracksPage:
 
 
 class OpenTracks:
-    """The folder of `mvseg track`, and one of its plants.
-
-    Attributes:
-        folder: of the tracks.
-        answers, learner, notice: there are none, see `Opened` and `OpenResult`.
-        recorded: the run that made them.
-        plant: that is corrected.
-    """
+    """The folder of `mvseg track`, the run that made it, and the plant that is corrected; without answers, learner and
+    notice."""
 
     learner, notice = None, ""
 
     def __init__(self, folder: Path, plant: str | None = None) -> None:
-        """Read the results of the plant's dates.
-
-        Raises:
-            InputError: see `read_recorded_tracks` and `track_leaves`; there is no such plant, or several and none is
-                named.
-        """
+        """Read the results of the plant's dates. Raises InputError: see `read_recorded_tracks` and `track_leaves`;
+        there is no such plant, or several and none is named."""
         self.folder, self.answers = folder, dict[str, Callable[[bytes], Mapping[str, Any]]]()
         self.recorded = read_recorded_tracks(folder)
         self.plant = _choose_plant(self.recorded, plant)
@@ -67,7 +57,6 @@ class OpenTracks:
         return replace(corrections, photos=self._photos)
 
     def page(self, corrections: Corrections) -> str:
-        """The page with the newest tracks, and with all edits."""
         correct = {
             "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
             "revision": name_edits(corrections.edits),
@@ -75,12 +64,8 @@ class OpenTracks:
         return build_tracks_page(self.plant.plant, self._page.data | {"correct": correct})
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
-        """The tracks with these edits; then, what the answers to each question would change.
-
-        Raises:
-            Cancelled: `is_old` said so.
-            InputError: see `track_leaves`.
-        """
+        """The tracks with these edits; then, the effects of the answers to each question. Raises Cancelled: `is_old`
+        said so; InputError: see `track_leaves`."""
         links, outcomes = self._links(corrections)
         self._page = page = self._track(links)
         yield Update(_without_pictures(page.data), outcomes, [])

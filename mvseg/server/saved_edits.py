@@ -25,12 +25,7 @@ class Refused(Exception):
 
 
 class SavedEdits:
-    """The newest edits of a folder. Not safe for threads: its owner holds a lock.
-
-    Attributes:
-        corrections: the newest ones.
-        notice: what the user should know of them; "" for nothing.
-    """
+    """The newest edits of a folder. Not safe for threads: the owner locks. `notice` is for the user, or ""."""
 
     def __init__(self, folder: Path, read: Read) -> None:
         """Raises InputError: the edits in the folder cannot be read, or are another scene's."""
@@ -49,7 +44,7 @@ class SavedEdits:
 
         Args:
             base: the `name_edits` of the list that this one was made from.
-            mark: what else is written with the edits.
+            mark: adds marks to the edits before they are written.
 
         Raises:
             InputError: this is no list of edits.
@@ -87,11 +82,8 @@ class SavedEdits:
         return False
 
     def take_changes(self, read: Read) -> bool:
-        """Go on from what another program has written to the file; False where it has written nothing.
-
-        Raises:
-            InputError: it cannot be read; the edits stay as they were.
-        """
+        """Go on from the file if another program has written to it; False where it has written nothing. Raises
+        InputError: it cannot be read; the edits stay as they were."""
         if not self.is_changed():
             return False
         stamp = self._find_stamp()
@@ -106,18 +98,14 @@ class SavedEdits:
         self._own.add(self.name)
 
     def begin(self) -> None:
-        """Write the newest edits before the folder is made anew.
-
-        Raises:
-            InputError: another program has changed the file.
-        """
+        """Write the newest edits before the folder is made anew. Raises InputError: another program changed it."""
         if self.is_changed():
             raise InputError(CHANGED)
         self._own.clear()
         self.write()
 
     def write_again(self) -> None:
-        """After the folder was made anew: write the newest edits where the file holds earlier ones of this page,
+        """Write the newest edits after the folder was made anew, where the file holds earlier ones of this page,
         whoever put them back; but never over those of another program."""
         with suppress(InputError):  # theirs, and broken: `is_changed` says so
             if name_edits(self._read_file().edits) in self._own:

@@ -69,8 +69,7 @@ class Arc:
     Attributes:
         azimuth, elevation: direction at its start, radians.
         steps: (n,) lengths of the pieces, mm.
-        droop: by how much it bends down in all, radians.
-        sweep: by how much it bends sideways in all, radians.
+        droop, sweep: by how much it bends down and sideways in all, radians.
     """
 
     azimuth: float
@@ -108,8 +107,8 @@ def blade_faces(rows: int) -> Ints:
 
 
 def grid_faces(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(F, 3) two triangles for each cell of an (r, c) grid of vertex indices; their normal points at a viewer who sees
-    the rows run down and the columns run to the right."""
+    """(F, 3) two triangles for each cell of an (r, c) grid of vertex indices; normals point at a viewer who sees the
+    rows run down and the columns run to the right."""
     a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
     return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
 

@@ -36,9 +36,6 @@ def arc_cameras(
         elevations_deg: above the horizon, taken in turn by the views; above -90 and below 90.
         width, height: pixels.
 
-    Returns:
-        V = num_views cameras in the plant's world units.
-
     Raises:
         InputError: a number out of its range.
     """

@@ -32,9 +32,8 @@ EVALUATED_FAMILIES = ("ovate", "lanceolate", "rosette", "strap", "lobed", "compo
 
 @dataclass(frozen=True)
 class Preset:
-    """Plan of a data set: for every split, number of leaves and number of views, that many plants.
-
-    A plant is the same for every number of views, and different from every plant of another split.
+    """Plan of a data set: for every split, number of leaves and number of views, that many plants. A plant is the same
+    for every number of views, and different from every plant of another split.
 
     Attributes:
         plants: (split, plants per number of leaves) pairs.
@@ -43,8 +42,7 @@ class Preset:
         families: the plants of a number of leaves take these in turn, each number starting one further on.
         has_free_cameras: cameras all around the plant, at any height and zoom, instead of the 200 degree arc.
         has_coco: write `<split>.json` with the leaves of all photos, category "leaf".
-        is_wild: all plants are as real ones are at home and outdoors, see `wild.make_wild`; cotyledons come on top of
-            the number of leaves.
+        is_wild: see `wild.make_wild`; cotyledons come on top of the number of leaves.
     """
 
     plants: tuple[tuple[str, int], ...]
@@ -121,7 +119,6 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
 
     Args:
         preset: a key of `PRESETS` or a `Preset` of your own.
-        folder: made when missing.
         seed: >= 0; other seeds give other plants.
         num_workers: processes, >= 1.
 
@@ -158,8 +155,7 @@ def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_w
 
 
 def claim_dataset(folder: Path, *, recipe: str) -> None:
-    """Claim an empty folder for a data set, or one that holds the same data set; unfinished files of a killed run are
-    deleted."""
+    """Claim a folder that is empty or holds the same data set, and delete unfinished files of a killed run."""
     made_from = folder / "dataset.json"
     if not made_from.is_file() and not all(is_partial(path) for path in folder.iterdir()):
         raise InputError(f"{folder}: holds files that are not a data set, expected a new or empty folder")

@@ -1,9 +1,8 @@
 """Procedural plants whose leaves are meshes of known area, length and width.
 
 A plant is grown from a family, a number of leaves and a seed. Shoots carry nodes (phyllotaxy with jitter), a node
-carries fronds, and a frond is a petiole with one blade or a rachis with several leaflets.
-
-World units are millimetres, +z is up, the foot of the stem is at the origin and the soil at z = 0. Angles are radians.
+carries fronds, and a frond is a petiole with one blade or a rachis with several leaflets. World units are millimetres,
++z is up, the foot of the stem is at the origin and the soil at z = 0. Angles are radians.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ class SimulatedPlant:
         family: a key of `FAMILIES`.
         leaves, parts: meshes; the first `len(stems)` parts are the stems.
         stems: (n, 3) points of each stem, from the foot to the tip, mm.
-        petioles: (n, 3) points of the petiole of each leaf, or of the rachis that its leaflet sits on, from its node on
-            the stem, mm; () where they are not known.
+        petioles: (n, 3) points of the petiole of each leaf, or of its leaflet's rachis, from its node on the stem, mm;
+            () where they are not known.
         is_wild: see `wild.make_wild`; its surroundings are those of homes and gardens, too.
     """
 
@@ -73,15 +72,12 @@ class Frond:
 
 
 def grow_plant(family: str, num_leaves: int, seed: int) -> SimulatedPlant:
-    """Grow a plant; the same arguments give the same plant, bit for bit.
+    """Grow a plant, in mm, with pot or bed and the ground; the same arguments give the same plant, bit for bit.
 
     Args:
         family: a key of `FAMILIES`.
-        num_leaves: 1 to 64 instances; the leaflets of a compound leaf count one each.
+        num_leaves: 1 to 64 instances, ids from 1 on; the leaflets of a compound leaf count one each.
         seed: >= 0.
-
-    Returns:
-        The plant with its pot (or a bed without one) and the ground; ids 1..num_leaves; millimetres.
 
     Raises:
         InputError: an unknown family, or a number of leaves or a seed out of range.
@@ -172,10 +168,8 @@ def grow_frond(node: StemNode, family: Family, rng: np.random.Generator, *, num_
 
 
 def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tuple[list[Floats], list[StemNode]]:
-    """Stems as (n, 3) points, and one node for every frond, shoot by shoot from the lowest to the top.
-
-    Further shoots come out of the lower nodes of the first one (branches) or out of the soil around it (tillers).
-    """
+    """Stems as (n, 3) points, and one node for every frond, shoot by shoot from the lowest to the top. Further shoots
+    come out of the lower nodes of the first one (branches) or out of the soil around it (tillers)."""
     shares = np.array_split(np.arange(num_fronds), math.ceil(num_fronds / family.per_shoot))
     is_tillering = rng.random() < family.tillers
     stems: list[Floats] = []

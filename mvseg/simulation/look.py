@@ -1,4 +1,4 @@
-"""What a photo looks like besides its geometry: light, materials and camera, drawn once per scene."""
+"""Light, materials and camera of a photo, drawn once per scene."""
 
 from __future__ import annotations
 
@@ -17,12 +17,10 @@ TEXTURE_SIZE = 256  # limit: pixels of a texture's side
 
 @dataclass(frozen=True, eq=False)
 class Marking:
-    """A second colour on every leaf of a plant.
+    """A second colour, linear RGB (3,), on every leaf of a plant.
 
     Attributes:
-        color: (3,) linear RGB.
-        vein, blotch, edge: how much veins, patches of noise and the margin of the leaf raise the share of the second
-            colour.
+        vein, blotch, edge: how much veins, patches of noise and the margin of the leaf raise the share of that colour.
         bias: share without any of them, before it is cut to [0, 1].
     """
 
@@ -110,8 +108,8 @@ def draw_look(rng: np.random.Generator) -> Look:
 
 
 def draw_wild_look(look: Look, rng: np.random.Generator) -> Look:
-    """The look with some features of photos from homes and gardens: stems as green as leaves, green pots and mats,
-    waxy or wet leaves, overexposure, and black studios, windows or other plants behind."""
+    """The look with some features of photos from homes and gardens: stems as green as leaves, green pots and mats, waxy
+    or wet leaves, overexposure, and black studios, windows or other plants behind."""
     plain, backdrop = look.plain.copy(), look.backdrop
     stem, pot, ground = 0, 1, 3
     if rng.random() < 0.4:

@@ -1,7 +1,5 @@
-"""What a plant stands in (pot, soil, ground), and the meshes of all that is not a leaf: tubes and turned profiles.
-
-World units are millimetres, +z is up and the soil is at z = 0.
-"""
+"""Pot, soil and ground, and the meshes of all that is not a leaf: tubes and turned profiles. World units are
+millimetres, +z is up and the soil is at z = 0."""
 
 from __future__ import annotations
 
@@ -28,8 +26,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Pot:
-    """A pot of radius and height in mm, its soil at z = 0 and the ground at z = -height; height 0 is a bed without a
-    pot."""
+    """A pot of radius and height in mm, its soil at z = 0, the ground at z = -height; height 0 is a bed."""
 
     radius: float
     height: float

@@ -1,8 +1,8 @@
 """Photo-like images of a plant with exact instance ids and depths, by ray casting on the CPU.
 
 The ray through each pixel centre decides id and depth; they depend on the plant and the camera only. Further rays tell
-how much of the sun and of the sky reaches a surface, and `shading` makes colours of that. Everything that colour
-depends on is drawn once per seed as a `Look`, so that all views of one plant share it.
+how much sun and sky reach a surface, and `shading` makes colours of that. A `Look`, drawn once per seed, holds
+everything that colour depends on, so that all views of one plant share it.
 """
 
 from __future__ import annotations
@@ -75,8 +75,7 @@ class Stage:
 
 
 def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
-    """Photograph a plant with one of V cameras, in the world units of the plant; ids and depth do not depend on the
-    seed of the stage."""
+    """Photograph a plant with one of V cameras, in its world units; ids and depth do not depend on the stage's seed."""
     K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
     width, height = cameras.sizes[view].tolist()
     center, world_from_px = (-R.T @ t).astype(np.float32), R.T @ np.linalg.inv(K)
@@ -191,9 +190,7 @@ def build_bvh(mesh: Mesh) -> EmbreeScene:
 
 def gather_skylight(bvh: EmbreeScene, look: Look, *, vertices: Floats, normals: Floats) -> Floats:
     """(2, P, 3) irradiance / pi from the sky on the side of each vertex that its normal points to, and on the other.
-
-    The same directions serve every vertex, so that the light is smooth over the surface.
-    """
+    The same directions serve every vertex, so that the light is smooth over the surface."""
     z = 1 - (2 * np.arange(SKY_RAYS) + 1) / SKY_RAYS
     angle = np.arange(SKY_RAYS) * np.pi * (3 - math.sqrt(5))
     level = np.sqrt(1 - z**2)

@@ -1,6 +1,4 @@
-"""One simulated scene on disk, as mvseg reads it.
-
-A scene folder holds
+"""One simulated scene on disk, as mvseg reads it. A scene folder holds
 
     cameras.json              rig: poses cam_from_world, pixel centres at half integers
     images/000.jpg            photos
@@ -35,12 +33,11 @@ MIN_PIXELS = 30  # limit: a leaf with fewer visible pixels in a view is left out
 
 
 def write_scene(folder: Path | str, plant: SimulatedPlant, cameras: Cameras, *, seed: int) -> None:
-    """Photograph a plant and write the scene folder described at the top of this module.
+    """Photograph a plant and write the scene folder described above. A failure leaves nothing behind.
 
     Args:
-        folder: must not exist; its parent is made. A failure leaves nothing behind.
+        folder: must not exist; its parent is made.
         plant: seen by the cameras in its own world units.
-        cameras: V views of any sizes.
         seed: of light, materials, noise and of the numbers in `masks/`; the truth does not depend on it.
 
     Raises:

@@ -53,7 +53,6 @@ class SeriesSpec:
     """One plant over days.
 
     Attributes:
-        name: of the plant.
         family: a key of `FAMILIES`.
         leaves: how many are there on the first date, and how many appear until the last, at least 1 and 0.
         times: days, rising.
@@ -87,7 +86,7 @@ class SeriesSpec:
 
 @dataclass(frozen=True)
 class PotPlace:
-    """How the pot stands on one date: turned by `turn` degrees about up, tilted by `lean` degrees towards azimuth
+    """Place of the pot on one date: turned by `turn` degrees about up, tilted by `lean` degrees towards azimuth
     `towards`, then shifted by (x, y) mm."""
 
     turn: float = 0.0
@@ -108,8 +107,7 @@ class PotPlace:
 
 @dataclass(frozen=True)
 class _Seat:
-    """Where and when a frond is: its shoot, its level there, its ids, and the days after the first date of its first
-    sight and of its first yellow."""
+    """Shoot, level and ids of a frond, and the days after the first date of its first sight and of its first yellow."""
 
     shoot: int
     level: int
@@ -211,7 +209,6 @@ def _seat_fronds(
 
 
 def _uncrowd(plant: GrowingPlant) -> GrowingPlant:
-    """The plant with each frond in the least crowded of a few poses, as full-grown plants have them."""
     seats, day = list(plant.seats), plant.spec.times[-1] - plant.spec.times[0] + EXPANSION
     taken = FAR_AWAY
     for index, seat in enumerate(seats):
@@ -230,8 +227,7 @@ def _size(age: float) -> float:
 
 
 def _age(leaf: Leaf, share: float) -> Leaf:
-    """The leaf after a share of its yellowing: it dries, rolls up a little and hangs down; unchanged for a share below
-    0."""
+    """The leaf after a share of its yellowing: it dries, rolls up a little and hangs; unchanged below 0."""
     if share <= 0:
         return leaf
     rolled = roll_up(leaf.vertices, 1.2 * share)
@@ -261,11 +257,8 @@ def move_plant(plant: SimulatedPlant, pot: PotPlace) -> SimulatedPlant:
 
 
 def grow_series(spec: SeriesSpec) -> list[SimulatedPlant]:
-    """The plant on every date, where its pot stands; a leaf has the same id on all dates.
-
-    Raises:
-        InputError: on a date no leaf is left.
-    """
+    """The plant on every date, where its pot stands; a leaf has the same id on all dates. Raises InputError: on a date
+    no leaf is left."""
     growing, plants = plan_plant(spec), []
     for index, (time, pot) in enumerate(zip(spec.times, draw_pots(spec), strict=True)):
         plant = growing.at(time - spec.times[0], is_wilted=index == spec.wilts)
@@ -291,10 +284,7 @@ def write_series(folder: Path, specs: Sequence[SeriesSpec]) -> None:
 
     Every scene is one of `write_scene`; its truth has the same number for the same leaf on all dates. `series.csv` is a
     table for `mvseg batch` (scene, name, plant, time), and `truth.csv` has one row per leaf and date (area, length,
-    width, dryness).
-
-    Raises:
-        InputError: the folder exists, or two plants have one name.
+    width, dryness). Raises InputError: the folder exists, or two plants have one name.
     """
     if folder.exists():
         raise InputError(f"{folder} exists already, expected a new folder for the series")

@@ -1,4 +1,4 @@
-"""The colours of a photo: what light makes of leaves, pot and ground, and what the camera makes of light."""
+"""The colours of a photo: light on leaves, pot and ground, and the camera's response to it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Hits:
         points: (n, 3).
         view: (n, 3) unit direction of the ray, away from the camera.
         material: (n,) index of MATERIALS.
-        leaf_id: (n,), 0 for what is not a leaf.
+        leaf_id: (n,), 0 = not a leaf.
         dryness: (n,) as in `Leaf.dryness`.
         face_normal: (n, 3) unit normal of the triangle.
         normal: (n, 3) normal, smooth from vertex to vertex, of any length.
@@ -89,11 +89,8 @@ def highlight(look: Look, uv: Floats, *, normal: Floats, view: Floats, direct: F
 def leaf_color(
     look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, dryness: Floats, has_parallel_veins: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """Colour of leaves of some dryness (n,) at (n, 2) positions `uv` on them.
-
-    Returns:
-        Albedo (n, 3); colour (n, 3) of the light that passes through; slope (n,) of the surface towards the tip.
-    """
+    """Colour of leaves of some dryness (n,) at (n, 2) positions `uv` on them: albedo (n, 3), colour (n, 3) of the light
+    that passes through, and slope (n,) of the surface towards the tip."""
     u, v, number = uv[:, 0], uv[:, 1], leaf_id.astype(np.float32)
     tint = look.leaf_spread * np.sin(number[:, None] * np.array([12.99, 78.23, 37.72], np.float32))
     blotch = sample_texture(look.texture, u * 40 + number * 37, v * 18 + number * 11)

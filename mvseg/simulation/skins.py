@@ -1,5 +1,4 @@
-"""What makes leaves of other species look different: the skins of real leaves, markings along the veins or in
-patches, and colours other than green."""
+"""Looks of other species: skins of real leaves, markings along veins or in patches, and colours other than green."""
 
 from __future__ import annotations
 
@@ -18,12 +17,8 @@ GAMMA = 2.2  # definition: of the photos that skins are cut from
 
 
 def list_skins(folder: Path | None) -> tuple[Floats, ...]:
-    """The skins of a folder of leaves that were cut out, PNG files with an alpha channel, in the order of their names;
-    none without a folder.
-
-    Raises:
-        InputError: no such folder, one without PNG files, or a file that is not a cut-out.
-    """
+    """The skins of a folder of cut-out leaves, PNG files with an alpha channel, in the order of their names; none
+    without a folder. Raises InputError: no such folder, one without PNG files, or a file that is not a cut-out."""
     if folder is None:
         return ()
     paths = sorted(folder.glob("*.png"))
@@ -41,16 +36,10 @@ def list_skins(folder: Path | None) -> tuple[Floats, ...]:
 
 
 def unroll_leaf(rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Floats:
-    """A leaf that was cut out as a texture over `Leaf.uv`.
+    """A cut-out leaf, `rgb` (H, W, 3) with `mask` (H, W), as a texture over `Leaf.uv`: (ROWS, COLUMNS, 3) linear RGB.
 
-    Its long axis becomes the first axis of the texture, and each row across it is stretched to the full width.
-
-    Args:
-        rgb: (H, W, 3).
-        mask: (H, W), True on the leaf.
-
-    Returns:
-        (ROWS, COLUMNS, 3) linear RGB. Which end of the leaf comes first is not known.
+    Its long axis becomes the first axis of the texture, and each row across it is stretched to the full width. Which
+    end of the leaf comes first is not known.
     """
     y, x = np.nonzero(mask)
     points = np.stack([x, y], 1) + 0.5

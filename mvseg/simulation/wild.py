@@ -1,5 +1,4 @@
-"""What plants at home and outdoors have and freshly grown ones lack: withered leaves, cotyledons, buds, woody stems and
-bare twigs.
+"""Features of plants at home and outdoors: withered leaves, cotyledons, buds, woody stems and bare twigs.
 
 World units are millimetres, +z is up and the soil is at z = 0. Angles are radians.
 """
@@ -24,13 +23,8 @@ SOIL_CLEARANCE = 2.0  # chosen: mm; leaves hang down no further
 def make_wild(plant: SimulatedPlant, seed: int) -> SimulatedPlant:
     """The plant with some of its leaves withered, and with buds, twigs, woody stems and cotyledons, each by chance.
 
-    Args:
-        plant: as `grow_plant` returns it.
-        seed: >= 0; the same arguments give the same plant, bit for bit.
-
-    Returns:
-        A plant with `is_wild`. Its first leaves are those of `plant`, with the same ids; cotyledons, if any, are
-        leaves, too, and come after them.
+    `plant` is as `grow_plant` returns it, `seed` >= 0; the same arguments give the same plant, bit for bit. The first
+    leaves of the result are those of `plant`, with the same ids; cotyledons are leaves, too, and come after them.
     """
     rng = np.random.default_rng([seed, len(plant.leaves)])
     share_withered = rng.choice([0.0, 0.15, 0.35])
@@ -63,9 +57,7 @@ def wither(leaf: Leaf, rng: np.random.Generator) -> Leaf:
 
 def roll_up(vertices: Floats, turn: float) -> Floats:
     """(P, 3) the blade with both halves rolled upwards around the midrib, their edges by `turn`; downwards if negative.
-
-    The midrib stays in place, and distances across the blade stay what they are.
-    """
+    The midrib stays in place, and distances across the blade stay what they are."""
     grid = vertices[1:-1].reshape(-1, BLADE_COLUMNS, 3)
     middle = BLADE_COLUMNS // 2
     along = np.gradient(np.concatenate([vertices[:1], grid[:, middle], vertices[-1:]]), axis=0)[1:-1]

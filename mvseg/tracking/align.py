@@ -1,7 +1,7 @@
-"""Where the plant of one date stands in the frame of another: the pot may have been turned, moved, set down askew.
+"""The plant of one date in the frame of another: the pot may have been turned, moved, set down askew.
 
 That the pot stands as it stood is one hypothesis among many; the others come from pairs of leaves. Each is refined on
-the leaves that it pairs, and has a probability: from how well they go together, and from how often this plant's pot is
+the leaves that it pairs. Its probability follows from how well they go together, and from how often this plant's pot is
 turned (`Habit`). The best one is taken, and its probability says how far to trust it.
 """
 
@@ -28,7 +28,7 @@ GUESS = (-2.02, 0.99, 2.05)  # fitted: python benchmarks/fit_chances.py; offset,
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """How the plant of one date stands on another.
+    """Pose of the plant of one date on another.
 
     Attributes:
         pose: (4, 4) second_from_first, a rotation and a shift.
@@ -47,11 +47,8 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Habit:
-    """How often a pot stands as on the date before: stated by the user, or estimated from the dates of a plant.
-
-    Attributes:
-        still: probability, before anything is known of a pair of dates.
-    """
+    """How often a pot stands as on the date before: stated by the user, or estimated from the dates of a plant. `still`
+    is its probability, before anything is known of a pair of dates."""
 
     still: float = ALIGN.still
 
@@ -75,9 +72,7 @@ class Poses:
     """H poses of one pair of dates, the first as it stood, that were looked at.
 
     Attributes:
-        pair: the dates.
-        refined: H.
-        gains: (H,) their gains, less what large new leaves cost.
+        gains: (H,) their gains, less the cost of large new leaves.
         near: (H,) in [0, 1], how near they are to "as it stood".
     """
 
@@ -106,9 +101,8 @@ class Poses:
 
 
 def list_poses(pair: Pair) -> Poses:
-    """The poses of two dates, each in its own frame, that look best, and those that leaves suggest which the user says
-    are one, each refined; where up is not known, of any rotation. Without leaves on one of them, only that it stood as
-    it stood."""
+    """The poses of two dates, each in its own frame, that look best, and those suggested by leaves that the user links,
+    each refined; where up is not known, of any rotation. Without leaves on one date, only "as it stood"."""
     if not pair.fewer:
         return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
     asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.link_costs < 0)[..., None]]
@@ -139,8 +133,8 @@ def guess_chance(gain: float, leaves: int) -> float:
     Args:
         gain: see `pose_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
             others of the two dates says nothing more.)
-        leaves: number of leaves of the date with fewer, >= 1. What they say is neither independent, then the sum would
-            count, nor all the same, then the mean would: the sum counts over the root of their number.
+        leaves: number of leaves of the date with fewer, >= 1. They are neither independent, then the sum of their
+            evidence would count, nor all the same, then the mean would: the sum counts over the root of their number.
     """
     offset, own, strange = GUESS
     return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
@@ -159,8 +153,8 @@ def _as_it_stood(pair: Pair) -> Alignment:
 
 
 def large_new(pair: Pair, pairs: np.ndarray) -> float:
-    """Cost of leaves of the larger half that are in no pair; 0 where all leaves of the date with fewer are in one:
-    then large ones were missed there. A plant that is turned onto its own older leaves has many."""
+    """Cost of leaves of the larger half that are in no pair, as when a plant is turned onto its own older leaves. 0
+    where all leaves of the date with fewer are in one: then large ones were missed there."""
     if len(pairs) == pair.fewer:
         return 0.0
     is_large = pair.second.lengths >= np.median(pair.second.lengths)
@@ -175,8 +169,8 @@ def near_world(pair: Pair, poses: Floats) -> Floats:
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
-    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the turns and, for the plant's middle,
-    of how far the base of a leaf moves: below 1, they are one."""
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the turns and, for the plant's middle, of
+    how far the base of a leaf moves: below 1, they are one."""
     middle = np.append(pair.first.midribs.mean((0, 1)), 1.0)
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm((others - pose)[:, :3] @ middle, axis=1)

@@ -1,9 +1,9 @@
 """Tracks over all dates at once: the observations of leaves are parted such that the costs within tracks are least.
 
-Not only neighbouring dates count: each leaf is compared with those of the three dates before and after, and a track's
-cost is the sum over all of its pairs. A leaf that looks odd on one date, or is missed, is held by the dates around it.
-The least sum is hard to find (a multicut, see Keuper et al., ICCV 2015); here all tracks are cut at a date, or one date
-is taken out of them, and their parts are joined anew, exactly (`linear_sum_assignment`), until that gains nothing.
+Each leaf is compared with those of the three dates before and after, and a track's cost is the sum over all of its
+pairs: a leaf that looks odd on one date, or is missed, is held by the dates around it. The least sum is hard to find (a
+multicut, see Keuper et al., ICCV 2015); here all tracks are cut at a date, or one date is taken out of them, and their
+parts are joined anew, exactly (`linear_sum_assignment`), until that gains nothing.
 """
 
 from __future__ import annotations
@@ -27,9 +27,7 @@ CALIBRATION = (0.33, 4.08)
 @dataclass(frozen=True)
 class Association:
     """Two observations of one leaf that follow each other, and the probability that they are: 1 if the user says so.
-
-    `link_leaves` gives it for dates that are surely aligned, `sum_over_poses` for any.
-    """
+    `link_leaves` gives it for dates that are surely aligned, `sum_over_poses` for any."""
 
     before: Observation
     after: Observation
@@ -46,12 +44,8 @@ def link_leaves(
 ) -> list[Association]:
     """The links of the cheapest tracks, by their earlier observation.
 
-    Args:
-        counts: number of leaves with a shape on each date.
-        same, different: pairs of observations that the user says are one leaf, or are not.
-
-    Raises:
-        InputError: the pairs contradict each other.
+    `counts` are the leaves with a shape on each date; `same` and `different` pairs of observations that the user says
+    are one leaf, or are not. Raises InputError: the pairs contradict each other.
     """
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     date_of, gains = np.repeat(np.arange(len(counts)), counts), np.zeros((starts[-1], starts[-1]))
@@ -80,7 +74,7 @@ def link_leaves(
 
 def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[Association]:
     """The links with probabilities summed over poses: that each is right under the one that was taken, and under the
-    others. What the user says is so under all of them."""
+    others. Links of the user are so under all of them."""
     associations = []
     for link in links:
         (earlier, row), (later, column) = link.before, link.after
@@ -92,7 +86,7 @@ def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[A
 
 def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     """{(earlier, later): (N, M) probability that leaves of these two dates are the same, summed over poses}, whatever
-    other dates and what the user say; for asking about those that are not linked."""
+    other dates and the user say; for asking about leaves that are not linked."""
     chances = {}
     for pair, costs in compared.costs.items():
         odds = np.exp(np.clip(LINKING.unlinked - costs, -LINKING.most_odds, LINKING.most_odds))
@@ -104,11 +98,7 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
 
 def join_observations(gains: Floats, date_of: np.ndarray) -> np.ndarray:
     """(S,) the track of each observation, such that gains within tracks are large; no track has two of one date.
-
-    Args:
-        gains: (S, S) symmetric, of each pair in one track; 0 for pairs that were not compared.
-        date_of: (S,) index of the date of each observation.
-    """
+    `gains` (S, S) symmetric are of each pair in one track, 0 where not compared; `date_of` (S,) are date indices."""
     tracks, dates = np.arange(len(gains)), np.unique(date_of)
     for date in dates[1:]:
         tracks = _rejoin(tracks, gains, date_of == date, among=date_of <= date)
@@ -138,17 +128,12 @@ def _rejoin(tracks: np.ndarray, gains: Floats, apart: np.ndarray, among: np.ndar
 def _part_gains(
     tracks: np.ndarray, gains: Floats, one: np.ndarray, other: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Floats]:
-    """Tracks of the observations `one` (S,) and `other` (S,), and gains (A, B) of joining each two of them."""
     (here, row), (there, column) = (np.unique(tracks[part], return_inverse=True) for part in (one, other))
     return here, there, np.eye(len(here))[row].T @ gains[np.ix_(one, other)] @ np.eye(len(there))[column]
 
 
 def _probabilities(tracks: np.ndarray, gains: Floats, later: np.ndarray) -> dict[int, float]:
-    """{track: that its later observations show the leaf of the earlier ones}, against all parts that they could join.
-
-    With gains as log odds, p = e^g / (1 + e^g + the sum of e^g over the others); its log odds are then stretched
-    (`CALIBRATION`).
-    """
+    """{track: P(its later observations show the same leaf)}, against all parts it could join (`CALIBRATION`)."""
     here, there, table = _part_gains(tracks, gains, ~later, later)
     odds, probabilities = np.exp(np.clip(table, -LINKING.most_odds, LINKING.most_odds)), {}
     for track in np.intersect1d(here, there).tolist():

@@ -1,8 +1,7 @@
 """Costs of links between two dates that are aligned: `fitted_costs`, once the earlier plant is bent as its pairs say.
 
 A plant leans, and its internodes stretch: each leaf moves as those around it did, and the better these agree, the more
-places tell. Both are regressions with a prior that is worth some pairs, so that few pairs hardly move the costs, and
-many decide.
+places tell. Both are regressions with a prior worth some pairs, so that only many pairs move the costs much.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ def bend(pair: Pair, alignment: Alignment) -> tuple[DateLeaves, Floats]:
 
     The shift of a base is linear in its place: a ridge regression over the pairs, `COSTS.prior_pairs` strong, of which
     each leaf is predicted without its own pair. Factors grow with the variance of that prediction, and with the median
-    error of all, which counts against `COSTS.usual` as many pairs as there are against the prior. Without pairs
-    nothing bends.
+    error of all, which weighs against `COSTS.usual` as the pairs do against the prior. Without pairs nothing bends.
     """
     first, prior = pair.first.moved(alignment.pose), COSTS.prior_pairs
     rows, columns = alignment.pairs.T

@@ -57,11 +57,8 @@ def compare_dates(
     same: Collection[tuple[Observation, Observation]] = (),
     different: Collection[tuple[Observation, Observation]] = (),
 ) -> Comparison:
-    """Dates at most `LINKING.most_gap` apart are compared.
-
-    `place_dates` says how they stand to each other, before anything is linked. Of `same` and `different`, pairs of
-    observations that the user says are one leaf, or are not, the earlier one first, the poses take note.
-    """
+    """Compare dates at most `LINKING.most_gap` apart, once `place_dates` has placed them, before anything is linked.
+    The poses take note of `same` and `different`, pairs of observations, the earlier one first, that the user links."""
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
         for later in range(len(dates)) for n in range(max(later - LINKING.most_gap, 0), later)
@@ -92,8 +89,7 @@ def compare_dates(
 
 
 def _under_others(of_pair: Poses, pose: Floats, habit: Habit) -> Floats:
-    """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
-    there is none."""
+    """(N, M) probability that leaves are the same if another pose than this (4, 4) is right; 0 without one."""
     every = np.stack([each.pose for each in of_pair.refined])
     weights = np.round(of_pair.weights(habit), ALIGN.digits) * (pose_distances(of_pair.pair, pose, every) >= 1)
     chances = np.zeros((len(of_pair.pair.first), len(of_pair.pair.second)))

@@ -1,4 +1,4 @@
-"""What tracking needs of one plant on one date, from a result folder or from a `Result` in memory."""
+"""Input of tracking: one plant on one date, from a result folder or from a `Result` in memory."""
 
 from __future__ import annotations
 
@@ -110,12 +110,10 @@ class PlantOnDate:
 
 
 def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnDate:
-    """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`.
+    """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`. Pictures of its leaves
+    are so many pixels wide or high; 0: without.
 
-    With pictures of its leaves, so many pixels wide or high; 0: without.
-
-    Raises:
-        InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
+    Raises InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
     """
     folder = find_result(folder)
     with collect_warnings():  # of cameras, which nobody needs here
@@ -130,11 +128,7 @@ def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnD
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:
-    """One date from a result in memory.
-
-    Raises:
-        InputError: it has no surfaces.
-    """
+    """One date from a result in memory. Raises InputError: it has no surfaces."""
     traits = result.traits
     if traits is None:
         raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
@@ -166,8 +160,7 @@ def read_time(time: str | float) -> float:
     """Days: the number itself, or days since year 1 of an ISO date (20260531, too; with a time of day and a time zone,
     if you like: then it is counted in UTC).
 
-    Raises:
-        InputError: it is neither; so are 0428 and numbers of `OBSERVATIONS.most_days` or more, which are no days.
+    Raises InputError: it is neither; so are 0428 and numbers of `OBSERVATIONS.most_days` or more, which are no days.
     """
     moment = _read_moment(str(time).strip())
     if isinstance(moment, float):
@@ -188,12 +181,8 @@ def _read_moment(text: str) -> float | datetime.datetime:
 
 
 def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
-    """The dates in order of time, all lengths in the unit of the first.
-
-    Raises:
-        InputError: two dates have the same time, numbers and ISO dates are mixed, units cannot be converted, or a leaf
-            has points that are no numbers.
-    """
+    """The dates in order of time, all lengths in the unit of the first. Raises InputError: two dates have the same
+    time, numbers and ISO dates are mixed, units cannot be converted, or a leaf has points that are no numbers."""
     for date in dates:
         for leaf in date.leaves:
             if not all(each is None or np.isfinite(each).all() for each in (leaf.midrib, leaf.normal, leaf.points)):

@@ -2,9 +2,8 @@
 other, and for linking leaves (`bent_costs.py`).
 
 The cost of a pair is minus the logarithm of how much likelier its differences are between two observations of one leaf
-than between a leaf and a stranger. Each difference has a scale of its own, widened by the standard deviations that the
-surfaces carry, and heavy tails: one odd number does not outweigh the others. A stranger is the nearer by chance, the
-more leaves there are.
+than between a leaf and a stranger. Each difference has its own scale, widened by the surfaces' standard deviations, and
+heavy tails: one odd number does not outweigh the others. With more leaves, a wrong leaf is more likely to lie nearby.
 """
 
 from __future__ import annotations
@@ -70,13 +69,11 @@ class Differences:
         height: (2, N, M) of the earlier base over the foot of the plant. The foot counts as the origin where that is
             below the lowest base by one `Pair.scale` at most.
         turn: (2, N, M) between the directions from base to tip, radians.
-        base_sd, turn_sd: that the surfaces carry.
+        base_sd, turn_sd: of the surfaces.
         longer, wider: of lengths, and of roots of areas, NaN where there are none.
         room: from the length of the earlier leaf to that of the longest one of the later date, >= 0.
-        days: between the dates.
         is_loose: only voxels show one of them.
         crowd: logarithm of the number of leaves.
-        knows_up: of both dates.
         near: distances between surfaces, see `_cloud_distances`; None where nobody asked for them.
         width: factor of the scales of places, in which `near` is measured, too.
     """
@@ -125,7 +122,7 @@ class Differences:
 
 def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = None) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
-    likelier than not. What the user says of them counts, too. `widths`: see `Differences`."""
+    likelier than not. The user's links count, too. `widths`: see `Differences`."""
     return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.link_costs
 
 
@@ -139,8 +136,7 @@ def costs_of(apart: Differences, scales: Scales) -> Floats:
 
 
 def _place_costs(apart: Differences, scales: Scales) -> Floats:
-    """(2, N, M) of bases and directions. A base moves up the more the higher it is, as internodes below it stretch;
-    where up is not known, as far in any direction."""
+    """(2, N, M) of bases and directions; higher bases move up more; where up is not known, as far in any direction."""
     across = student_tail(apart.across / np.hypot(scales.across * apart.width, apart.base_sd), 2)
     up = (scales.along + scales.stretch * apart.height) * apart.width
     along = student_tail(apart.along / np.hypot(up, apart.base_sd), 1)
@@ -154,7 +150,7 @@ def size_costs(apart: Differences, scales: Scales) -> Floats:
 
     A size is the root of an area, or a length where one of the two leaves has no area. A leaf that grows has room to
     until it is as long as the longest one of the later date, and grows the faster the more it has, up to a factor of e.
-    Nobody knows which leaves do: either may be so.
+    Nobody knows which leaves grow: either may be so.
     """
     larger = np.where(np.isfinite(apart.wider), apart.wider, apart.longer)
     growth = np.minimum(scales.growth * apart.days * np.minimum(apart.room, 1.0), apart.room)
@@ -166,8 +162,7 @@ def size_costs(apart: Differences, scales: Scales) -> Floats:
 
 
 def _cloud_distances(pair: Pair) -> Floats:
-    """(N, M) mean distance of the points of one leaf from the other, the nearer way of two: a leaf that is seen in part
-    lies on the whole one."""
+    """(N, M) mean distance of the points of one leaf from the other, the nearer way of two: for leaves seen in part."""
     shape = (len(pair.first), OBSERVATIONS.cloud, len(pair.second), OBSERVATIONS.cloud)
     apart = cdist(pair.first.points.reshape(-1, 3), pair.second.points.reshape(-1, 3)).reshape(shape)
     return np.minimum(apart.min(3).mean(1), apart.min(1).mean(2)) / pair.scale

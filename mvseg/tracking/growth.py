@@ -25,8 +25,8 @@ NOTHING = Number(math.nan, math.nan, "")
 
 @dataclass(frozen=True)
 class GrowthPoint:
-    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours; of two
-    dates the later one has it."""
+    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours (of two dates
+    the later one has it)."""
 
     track: int
     trait: str
@@ -60,12 +60,7 @@ class PlantRow:
 
 @dataclass(frozen=True)
 class Growth:
-    """Growth of all leaves and of the plant.
-
-    Attributes:
-        points: all traits of all tracks on the dates on which they were measured, by track, trait and time.
-        plant: one row per date.
-    """
+    """Growth of all leaves, by track, trait and time, where measured; and of the plant, one row per date."""
 
     points: tuple[GrowthPoint, ...]
     plant: tuple[PlantRow, ...]
@@ -137,8 +132,7 @@ def find_origins(tracks: Tracks, trait: str) -> dict[tuple[int, int], Hashable]:
 def _with_one_origin(
     tracks: Tracks, by_track: Mapping[int, Mapping[int, Number]], origins: Mapping[tuple[int, int], Hashable]
 ) -> tuple[dict[int, dict[int, Number]], dict[tuple[int, int], Hashable]]:
-    """Heights {track: {date: number}} and their origins; those of a pot with several origins start from the lowest leaf
-    that has a height on all of its dates."""
+    """Heights {track: {date: number}} and origins; several origins become one leaf that all dates have."""
     moved, same = {track: dict(numbers) for track, numbers in by_track.items()}, dict(origins)
     for root in set(tracks.roots):
         dates = [date for date, each in enumerate(tracks.roots) if each == root]

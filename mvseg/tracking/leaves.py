@@ -99,8 +99,8 @@ class Pair:
         first, second: each in its date's frame, until `moved`.
         days: between the dates, > 0.
         knows_up: +z is up in both frames.
-        scale: what places are measured in, see `Pair.of`.
-        link_costs: (N, M) what the user says of two leaves, as a cost: below 0 they are one, above 0 they are not.
+        scale: unit of places, see `Pair.of`.
+        link_costs: (N, M) links of the user, as a cost: below 0 they are one, above 0 they are not.
     """
 
     first: DateLeaves

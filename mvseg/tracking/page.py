@@ -27,18 +27,14 @@ SERVED_SCRIPTS = ("selection.js", "numbers.js", "edits.js", "server.js")  # of t
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
-    """Write tracks.html into a folder.
-
-    Raises:
-        OSError: it cannot be written.
-    """
+    """Write tracks.html into a folder. Raises OSError."""
     page = build_tracks_page(tracks.plant, describe_tracks(tracks, growth))
     (folder / PAGE_FILE).write_text(page, encoding="utf-8", newline="\n")
 
 
 def build_tracks_page(plant: str, data: Mapping[str, Any]) -> str:
     """The page; `data` of `describe_tracks`, with "correct" where `mvseg correct` serves it: {"edits", "revision", and
-    what else its script reads}."""
+    the rest that its script reads}."""
     is_served = "correct" in data
     scripts = [REPORT_ASSETS / name for name in SERVED_SCRIPTS] if is_served else []
     styles = ["tracks.css", *(["tracks_correct.css"] if is_served else [])]
@@ -55,9 +51,7 @@ def build_tracks_page(plant: str, data: Mapping[str, Any]) -> str:
 
 def write_index(path: Path, plants: Sequence[tuple[str, int, int]]) -> None:
     """Write the list of the pages of many plants: (plant, number of dates, number of tracks), as numbered folders.
-
-    Those without dates failed, and have none.
-    """
+    Those without dates failed, and have none."""
     rows = "\n".join(
         f'<tr><td><a href="plants/{number:05d}/{PAGE_FILE}">{html.escape(plant)}</a><td>{dates}<td>{tracks}</tr>'
         for number, (plant, dates, tracks) in enumerate(plants, start=1)

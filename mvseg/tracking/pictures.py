@@ -61,7 +61,6 @@ def picture_plant(result: Result) -> bytes:
 
 
 def _inner_point(mask: np.ndarray) -> tuple[float, float]:
-    """x, y of the middle of the pixel of a mask (H, W) that is farthest from its edge."""
     depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     return float(column) + 0.5, float(row) + 0.5

@@ -1,4 +1,4 @@
-"""How all dates of a plant stand to each other: of the poses that pairs of dates suggest, those that go together best.
+"""Poses of all dates of a plant: of the poses that pairs of dates suggest, those that go together best.
 
 Two dates that look alike in more than one way are settled by the others. From the chain of the likeliest alignments on,
 one date after the other takes, of the poses that its pairs with the others suggest, that under which all of these pairs
@@ -34,15 +34,11 @@ Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4
 
 
 def place_dates(num_dates: int, poses_of_pairs: PosesOfPairs, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
-    """The poses of T dates.
-
-    Args:
-        poses_of_pairs: {(earlier, later): the poses of two dates that were looked at}.
+    """The poses of T dates, from `poses_of_pairs` {(earlier, later): the poses of two dates that were looked at}.
 
     Returns:
         (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)
-        the index of that date; and (T - 1,) the probability that the turn from each date to the next is right, see
-        `weigh_turns`.
+        the index of that date; and (T - 1,) the probability of each turn to the next date, see `weigh_turns`.
     """
     if habit.still == 1:  # somebody says so
         return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
@@ -93,8 +89,7 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
 
 
 def _search(poses: Floats, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness) -> Floats:
-    """One date after the other, alone or with all later ones, moves so that two dates stand as their alignment says, if
-    all then agree better; the first one, too: where it is the odd one, all others would have to move."""
+    """Move dates, each alone or with all later ones, to stand as their alignments say, if all then agree better."""
     for _ in range(ALIGN.date_rounds):
         before = poses
         for date in range(len(poses)):
@@ -108,7 +103,6 @@ def _search(poses: Floats, alignments: Mapping[tuple[int, int], Alignment], like
 def _move(
     poses: Floats, moving: slice, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
 ) -> Floats:
-    """The poses (T, 4, 4) themselves, or those with some dates moved as one that agree best."""
     is_moving = np.zeros(len(poses), bool)
     is_moving[moving] = True
     best, most = poses, 0.0

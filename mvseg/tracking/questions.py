@@ -1,4 +1,4 @@
-"""What the user is asked about a plant's tracks: the most doubtful links, and what another answer would change."""
+"""Questions to the user about a plant's tracks: the most doubtful links, and the effects of another answer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ class Question:
     """Are two leaves of different dates the same?
 
     Attributes:
-        before, after: the leaves.
         is_linked: they are, as the tracks say; otherwise `before` has no later observation, and `after` no earlier one.
         doubt: probability that the tracks are wrong there.
     """
@@ -39,8 +38,8 @@ class Question:
 
 
 def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Question]:
-    """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one. What the
-    `links` answer is not asked again."""
+    """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one. Questions
+    that `links` answer are left out."""
     linked = {frozenset(pair) for link in links for pair in combinations(link.leaves, 2)}
     every = sorted((*_of_links(tracks), *_of_ends(tracks)), key=lambda each: (-each.doubt, each.before, each.after))
     asked: list[Question] = []

@@ -1,4 +1,4 @@
-"""Which results a folder of tracks was made of, as its run.json says, so that they can be tracked again."""
+"""Results from which a folder of tracks was made, by its run.json, so that they can be tracked again."""
 
 from __future__ import annotations
 
@@ -28,11 +28,8 @@ class PlantResults:
     times: tuple[str, ...]
 
     def read(self, *, pictures: int) -> list[PlantOnDate]:
-        """Its dates, those with results of one name told apart; for `pictures` see `read_date`.
-
-        Raises:
-            InputError: see `read_date`; or one has no time.
-        """
+        """Its dates, those with results of one name told apart; for `pictures` see `read_date`. Raises InputError: see
+        `read_date`; or one has no time."""
         dated = list(zip(self.folders, self.times, strict=True))
         missing = [folder.name for folder, time in dated if not time]
         if missing:
@@ -45,7 +42,6 @@ class RecordedTracks:
     """The run of `mvseg track` that made a folder.
 
     Attributes:
-        folder: of the tracks.
         plants: in their order; the results are where they are now, if they moved together with the tracks.
         pots: see `track_leaves`.
         corrections: the file of links that were given, if it is still there.
@@ -109,12 +105,8 @@ def is_tracks(folder: Path) -> bool:
 
 
 def read_recorded_tracks(folder: Path) -> RecordedTracks:
-    """The run that made a folder of tracks.
-
-    Raises:
-        InputError: these are no tracks, or those of a version that did not say what they were made of; a result is
-            gone.
-    """
+    """The run that made a folder of tracks. Raises InputError: these are no tracks, or those of a version that did not
+    record their results; a result is gone."""
     wait_until_whole(folder)
     if not is_tracks(folder):
         raise InputError(f"{folder}: holds no tracks.csv and {RUN_FILE}, expected the output of mvseg track")

@@ -55,9 +55,7 @@ def write_track_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
 
 def join_tables(folder: Path, parts: Sequence[Path]) -> None:
     """Move the tables of plants from their folders into one of each, one below the other; plants without any failed.
-
-    One line is in memory at a time: an experiment may have thousands of plants.
-    """
+    One line is in memory at a time: an experiment may have thousands of plants."""
     for name in COLUMNS:
         is_first = True
         with (folder / name).open("wb") as whole:

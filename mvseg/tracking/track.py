@@ -35,8 +35,8 @@ class TrackRow:
         date: index into `Tracks.dates`.
         track: from 1 on: from below, by the mean height of its base, where up is known on all dates; otherwise in the
             order of appearance. The plants of other frames (`Tracks.roots`) and leaves without a shape come last.
-        state: "born" where it appears after the first date, "seen", "hidden" between two observations, "gone" on
-            the first date on which it is missing for good.
+        state: "born" where it appears after the first date, "seen", "hidden" between two observations, "gone" on the
+            first date on which it is missing for good.
         leaf: its id in that date's result; None where the track is hidden or gone.
         probability: that the leaf is the one that the track showed before; NaN of the first one of a track, and where
             there is no leaf.
@@ -54,7 +54,6 @@ class Tracks:
     """The leaves of one plant over days.
 
     Attributes:
-        plant: its name.
         dates: in the order of time, all in the unit of the first.
         rows: by date, then by track.
         poses: (T, 4, 4) first_from_date, from the frame of a date to that of the earliest date that it is aligned with,
@@ -211,7 +210,6 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.
 
 
 def _rank_tracks(rows: Sequence[TrackRow], dates: Sequence[PlantOnDate], compared: Comparison) -> tuple[TrackRow, ...]:
-    """Number the tracks from below, see `TrackRow.track`."""
     bases = {(n, leaf.leaf): leaf.midrib for n, date in enumerate(dates) for leaf in date.leaves if date.knows_up}
     heights: dict[int, list[float]] = {row.track: [] for row in rows}
     first = dict[int, int]()  # root of each track

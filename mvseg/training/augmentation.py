@@ -1,4 +1,4 @@
-"""Turns samples into training data of a detector: augmentation, targets, and the order of an epoch.
+"""Training data of a detector from samples: augmentation, targets, and the order of an epoch.
 
 Everything random here is a pure function of (seed, epoch, index): a training run sees the same photos whatever its
 number of workers or processes, and however often it is interrupted.
@@ -36,10 +36,7 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
     """Samples by (epoch, index), augmented: (3, S, S) float32 photo in [0, 1], target as `make_target`, index.
 
     The same key gives the same bits in every process. Indices from len(samples) on are new plants, other ones in every
-    epoch.
-
-    Raises:
-        InputError: on access, when a sample broke since it was checked; see `read_sample`.
+    epoch. Raises InputError on access, when a sample broke since it was checked; see `read_sample`.
     """
 
     def __init__(self, samples: SampleList, config: TrainConfig) -> None:
@@ -73,11 +70,8 @@ def augment(
     """Augment one sample as the config says; torch's global generator is left as it was.
 
     Ignored pixels are painted over with the mean colour first: the network can then learn neither a leaf nor background
-    from them.
-
-    Returns:
-        (3, S, S) float32 photo in [0, 1] and its target, see `make_target`. Not `is_padded`: S x S or less, no more
-        than the scaled photo.
+    from them. Returns a (3, S, S) float32 photo in [0, 1] and its target, see `make_target`; not `is_padded`: S x S or
+    less, no more than the scaled photo.
     """
     photo = labelled.photo.clone()
     photo[:, labelled.ignore] = torch.tensor(MEAN_COLOR, dtype=photo.dtype)[:, None]
@@ -100,8 +94,7 @@ def augment(
 
 
 def happens(probability: float) -> bool:
-    """Draw whether an event of this probability happens; probability 0 draws no number, so that new options keep old
-    recipes reproducible."""
+    """Draw whether an event happens; probability 0 draws no number, so that old recipes stay reproducible."""
     return bool(probability) and float(torch.rand(())) < probability
 
 
@@ -117,11 +110,8 @@ def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Ten
 
 def rescale(photo: Tensor, layers: Tensor, config: TrainConfig, *, is_padded: bool = True) -> tuple[Tensor, Tensor]:
     """Scale by a random factor and take an S x S window at a random place; fill it, or take less, where the photo is
-    smaller.
-
-    Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask against its
-    photo by up to half a pixel.
-    """
+    smaller. Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask
+    against its photo by up to half a pixel."""
     side = config.image_size
     low, high = (math.log(factor) for factor in config.scale_range)
     factor = math.exp(low + (high - low) * float(torch.rand(()))) * side / max(photo.shape[1:])
@@ -145,16 +135,10 @@ def distort_color(config: TrainConfig) -> v2.Transform:
 
 
 def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_PX) -> Target:
-    """The target of torchvision's detectors.
+    """The target of torchvision's detectors from layers (L, H, W) int, see `LabelledPhoto`, and classes (N,) int64.
 
-    Args:
-        layers: (L, H, W) int, see `LabelledPhoto`.
-        classes: (N,) int64.
-        min_pixels: instances of fewer pixels are discarded.
-
-    Returns:
-        "masks" (M, H, W) uint8, "labels" (M,) int64, "boxes" (M, 4) float32 xyxy, half-open, recomputed from the masks.
-        M may be 0.
+    Returns "masks" (M, H, W) uint8, "labels" (M,) int64, "boxes" (M, 4) float32 xyxy, half-open, recomputed from the
+    masks. M may be 0: instances of fewer than `min_pixels` are discarded.
     """
     areas = torch.bincount(layers.flatten(), minlength=len(classes) + 1)[1:]
     rows = (areas >= min_pixels).nonzero()[:, 0]
@@ -168,13 +152,11 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
 
 
 def order_epoch(num_samples: int, batch_size: int, *, seed: int, epoch: int) -> list[list[int]]:
-    """The batches of an epoch: every sample once, in random order; the last batch is filled up from a second shuffle.
+    """The batches of an epoch, ceil(num_samples / batch_size) lists of batch_size sample indices: every sample once, in
+    random order; the last batch is filled up from a second shuffle.
 
     (Dropping an incomplete batch would lose up to batch_size - 1 of a user's few photos; a smaller batch would not fit
     the learning rate.)
-
-    Returns:
-        ceil(num_samples / batch_size) lists of batch_size sample indices.
     """
     generator = torch.Generator().manual_seed(mix_seed(seed, epoch))
     num_batches = math.ceil(num_samples / batch_size)

@@ -1,9 +1,8 @@
 """Photos with instance masks as training samples: finding, checking and reading them.
 
-Masks are of every kind that scenes have, and read by the same readers: label images (0 is background, 65535 is ignored)
-and other files that are named after the photos (`recognise_masks`), or COCO. A photo without any instance is a sample
-like any other, provided that its label image or its COCO entry exists.
-All broken samples are reported by name; nothing is dropped silently.
+The readers of scenes read masks of every kind: label images (0 is background, 65535 is ignored) and other files that
+are named after the photos (`recognise_masks`), or COCO. A photo without any instance is a sample like any other if it
+has a label image or a COCO entry. All broken samples are reported by name; nothing is dropped silently.
 """
 
 from __future__ import annotations
@@ -47,8 +46,7 @@ class Sample:
     """One photo and where its instances are.
 
     Attributes:
-        name: the photo's path below its folder; what reports and logs call it.
-        photo: the image file.
+        name: the photo's path below its folder; reports and logs use it.
         kind: of its files of masks, see `MaskFiles`; "" when the instances come from `annotations`.
         files: of its masks; none for a photo without instances.
         annotations: COCO annotations of this photo; pixels of those with `iscrowd` are ignored.
@@ -97,8 +95,7 @@ def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> Sample
         photos: folder, searched with its subfolders.
         labels: as `masks` of `load_masks`: a folder with `<path of the photo>.png` for every photo, for example, or a
             COCO .json file.
-        crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`; if they are left out, their pixels are
-            ignored.
+        crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`; pixels of omitted ones are ignored.
 
     Returns:
         Samples in the order of their names. Photos are not opened; see `check_samples`. Masks that are no COCO have one
@@ -180,11 +177,10 @@ def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Cro
 
 
 def read_sample(sample: Sample) -> LabelledPhoto:
-    """Read a photo and its instances. Does not use OpenCV's threads, which do not survive the fork of a data loader.
+    """Read a photo and its instances, without OpenCV's threads, which do not survive the fork of a data loader.
 
-    Raises:
-        InputError: the photo or a file of its masks is missing or cannot be read, sizes differ, or an annotation has an
-            unknown category, no pixels, or a malformed mask. The message starts with the sample's name.
+    Raises InputError: the photo or a file of its masks is missing or cannot be read, sizes differ, or an annotation has
+    an unknown category, no pixels, or a malformed mask. The message starts with the sample's name.
     """
     return _read(sample)[0]
 
@@ -213,8 +209,7 @@ def _read(sample: Sample) -> tuple[LabelledPhoto, int]:
 
 
 def _read_annotations(sample: Sample, photo: np.ndarray) -> tuple[LabelledPhoto, int]:
-    """A photo with its COCO annotations, and how many have no pixel; crowds become ignored pixels, but for those of
-    other annotations."""
+    """A photo with its COCO annotations, and how many have no pixel; other pixels of crowds are ignored."""
     height, width = photo.shape[:2]
     if sample.size is not None and sample.size != (width, height):
         stated = f"{sample.size[0]} x {sample.size[1]}"
@@ -242,12 +237,10 @@ def _read_annotations(sample: Sample, photo: np.ndarray) -> tuple[LabelledPhoto,
 
 def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]:
     """Read every sample once, in threads, with a progress bar: the number of instances of each (0 for a broken one),
-    and {index: what is wrong with it}.
+    and {index: fault}.
 
-    Warns (InputWarning) of entries that are no masks, and of instances that are the background of their photo.
-
-    Raises:
-        InputError: the label images were scaled with interpolation.
+    Warns (InputWarning) of entries that are no masks, and of instances that are the background of their photo. Raises
+    InputError: the label images were scaled with interpolation.
     """
 
     def inspect(sample: Sample) -> tuple[int, int, bool, np.ndarray] | str:
@@ -282,14 +275,11 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
 def keep_sound(
     samples: SampleList, what: str, *, skip_broken: bool, skip_unlabelled: bool = False
 ) -> tuple[SampleList, dict[int, str]]:
-    """The samples that can be used, and what is wrong with the others; `what` they are called in messages.
+    """The samples that can be used, and the faults of the others; messages call them `what`.
 
     Warns (InputWarning) of photos without labels, which would be learned as photos without leaves, unless
-    `skip_unlabelled` leaves them out.
-
-    Raises:
-        InputError: a sample is broken and `skip_broken` is off (the message counts them and describes the first three);
-            or no sample is left with an instance.
+    `skip_unlabelled` leaves them out. Raises InputError: a sample is broken and `skip_broken` is off (the message
+    counts them and describes the first three); or no sample is left with an instance.
     """
     warn_of_turned([sample.photo for sample in samples.samples])
     with faults_of(f"{what} samples"):

@@ -58,11 +58,11 @@ def fine_tune(
     num_steps: int = STEPS,
     seed: int = 0,
 ) -> GeneralizedRCNN:
-    """The detector after it has learned the leaves of some photos.
+    """The detector after it has learned the leaves of some photos, in eval mode, on the same device.
 
-    What is ignored in a photo teaches nothing: an anchor or a proposal that shows much of it (`SPARED`) is no example
-    of background. The mask head learns from labels alone. Deterministic for a seed, on one processor with as many
-    threads. torch's global generators are left as they were.
+    Ignored pixels teach nothing: an anchor or a proposal that shows many of them (`SPARED`) is no example of
+    background. The mask head learns from labels alone. Deterministic for a seed, on one processor with as many threads.
+    torch's global generators are left as they were.
 
     Args:
         detector: any torchvision Mask R-CNN whose norms do not look at the batch, as `load_detector` gives it (norms
@@ -71,9 +71,6 @@ def fine_tune(
         boxes: (V, 4) int64 xyxy, the parts of the photos that the detector will look at. It learns at the size that its
             transform gives them.
         seed: of the order of the samples, their augmentation, and the samplers of the losses.
-
-    Returns:
-        A detector of the same kind, in eval mode, on the same device.
 
     Raises:
         InputError: no labels; a gradient that is not finite.
@@ -115,7 +112,7 @@ def gather_samples(
     detector: GeneralizedRCNN, photos: ReadPhoto, labels: ViewLabels, *, boxes: Tensor
 ) -> list[tuple[LabelledPhoto, int]]:
     """The parts of the photos that have a label, at the largest size that they are learned at, and the longer side,
-    pixels, at which the detector sees each of them."""
+    pixels, at which the detector sees each."""
     samples = []
     for view in labels.leaves.view_index.unique().tolist():
         x1, y1, x2, y2 = boxes[view].tolist()
@@ -129,7 +126,6 @@ def gather_samples(
 
 
 def _order(num_samples: int, seed: int) -> Iterator[tuple[int, int]]:
-    """(epoch, index) of one sample after another, without end: all of them in random order, again and again."""
     for epoch in itertools.count():
         for batch in order_epoch(num_samples, num_samples, seed=seed, epoch=epoch):
             yield from ((epoch, index) for index in batch)

@@ -1,7 +1,5 @@
 """Results as training samples: masks that `mvseg infer` found and the other views verified, or that the user corrected.
-
-What is a label, `are_labels` says. All other masks are ignored, not background.
-"""
+`are_labels` selects labels. All other masks are ignored, not background."""
 
 from __future__ import annotations
 
@@ -17,14 +15,10 @@ from mvseg.training.view_labels import are_labels
 
 
 def list_results(folder: Path) -> SampleList:
-    """The samples of a result folder of `mvseg infer` or `mvseg match`, or of all results in a folder.
+    """The samples of a result folder of `mvseg infer` or `mvseg match`, or of all results in a folder: one for each
+    photo of the scene that run.json names, called "<result>/<photo>".
 
-    Returns:
-        One sample for each photo, named "<result>/<photo>". Photos are those of the scene that run.json names.
-
-    Raises:
-        InputError: no result, or a broken one, see `load_result`; one without a mask to learn from, or whose photos are
-            gone.
+    Raises InputError: no result, or a broken one, see `load_result`; no mask to learn from; photos are gone.
     """
     is_result = (folder / "instances.json").is_file()
     found = [folder] if is_result else sorted(path.parent for path in folder.glob("*/instances.json"))

@@ -4,8 +4,8 @@ One optimisation step takes `batch_size` samples, in chunks of `images_per_forwa
 chunks of a step; a single process works through them one after another and adds up the gradients. Each chunk seeds the
 random samplers of torchvision's losses from (seed, step, chunk), and no norm looks at the batch
 (`detectors/mask_rcnn.py`). So a run depends on `batch_size` and `images_per_forward` but not on the number of
-processes: torchvision normalises its losses over the images of one forward call, and these are the same images. Only
-the order in which the gradients of the chunks are added up differs.
+processes, except for the order in which gradients are added up: torchvision normalises its losses over the images of
+one forward call, and these are the same images.
 
 All randomness is a function of the seed and the step. A killed run therefore resumes with the same bits (on a CPU, with
 the same number of threads) without the state of any generator or scheduler in its checkpoint. Only `precision: auto`
@@ -65,7 +65,6 @@ class Run:
     """Constants of a run.
 
     Attributes:
-        config: the user's options.
         processes: this process among those that train together.
         samples: the sound training samples.
         held_out: the sound validation samples, None without validation.
@@ -121,11 +120,8 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
 
 
 def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
-    """The training and the validation samples, checked; broken_samples.txt is written if some are skipped.
-
-    Raises:
-        InputError: an output folder that holds something else, broken samples, nothing to train on.
-    """
+    """The training and the validation samples, checked; broken_samples.txt is written if some are skipped. Raises
+    InputError: an output folder that holds something else, broken samples, nothing to train on."""
     check_out(config.output, OUTPUT)
     parts, crowd = [], config.coco_crowd
     if config.photos is not None and config.labels is not None:
@@ -185,10 +181,7 @@ def train_epoch(run: Run, state: TrainingState, *, network: nn.Module, chunks: I
     """Do the remaining steps of the current epoch, with checkpoints on the way and one at the end.
 
     `network` is the state's model, wrapped if several processes train; `chunks` are those of this process from the
-    state's step on.
-
-    Raises:
-        InputError: a loss or a gradient is not finite; the message names the photos.
+    state's step on. Raises InputError: a loss or a gradient is not finite; the message names the photos.
     """
     config, epoch, num_steps = run.config, len(state.history), run.steps_per_epoch
     first = state.step - epoch * num_steps
@@ -271,9 +264,7 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
 
 
 def _leave_signals(_: int) -> None:
-    """A worker ends with its parent. A SIGTERM that a scheduler sends to all processes is left to the parent, which
-    would report a dead worker with a traceback; and so is what breaks when the parent goes. Errors of samples are not
-    affected: they reach the parent."""
+    """Workers end with their parent, which alone handles SIGTERM. Errors of samples still reach the parent."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.excepthook = lambda *_: None
 

@@ -1,8 +1,5 @@
-"""Photos of new plants, rendered while a detector trains, each a pure function of its seed.
-
-Rays are cast at the size that the detector trains at, so that nothing is scaled afterwards: small leaves
-and leaves that fill the photo are equally sharp.
-"""
+"""Photos of new plants, rendered while a detector trains, each a pure function of its seed. Rays are cast at the size
+that the detector trains at, so that nothing is scaled afterwards: leaves of all sizes are equally sharp."""
 
 from __future__ import annotations
 
@@ -42,8 +39,7 @@ def render_new_plant(
         seed: >= 0; the same arguments give the same photo, bit for bit, on one machine.
         size: S; the photo is S x S pixels.
         backgrounds: photos without leaves, to be seen behind a plant whose ground is taken away.
-        skins: as `mvseg.simulation.skins.list_skins` returns them; with them, two in three plants look like those of
-            other species (see `dress`).
+        skins: as `list_skins` returns them; with them, two in three plants look like other species (see `dress`).
 
     Raises:
         InputError: a background that cannot be read.
@@ -76,8 +72,8 @@ def render_new_plant(
 
 
 def place_camera(plant: SimulatedPlant, size: int, rng: np.random.Generator) -> Cameras:
-    """One camera of S x S pixels from any side above the ground, that has one leaf of the plant in sight, at 0.6 to
-    4 times the focal length that fills the frame."""
+    """One camera of S x S pixels from any side above the ground, that has one leaf of the plant in sight, at 0.6 to 4
+    times the focal length that fills the frame."""
     from mvseg.simulation.cameras import arc_cameras
 
     elevation = math.degrees(math.asin(rng.uniform(-0.05, 0.998)))
@@ -96,11 +92,7 @@ def place_camera(plant: SimulatedPlant, size: int, rng: np.random.Generator) -> 
 
 
 def list_backgrounds(folder: Path | None) -> tuple[Path, ...]:
-    """The photos of a folder in the order of their names; none without a folder.
-
-    Raises:
-        InputError: no such folder, or one without photos.
-    """
+    """The photos of a folder in the order of their names; none without one. Raises InputError: no folder or photo."""
     if folder is None:
         return ()
     found = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTO_SUFFIXES)

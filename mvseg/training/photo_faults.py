@@ -1,7 +1,5 @@
-"""What real photos have and rendered ones lack: uneven light, camera faults, clutter, and leaves that are not green.
-
-All of it is drawn from torch's global generator.
-"""
+"""Faults that real photos have and rendered ones lack: uneven light, camera faults, clutter, and leaves that are not
+green; drawn from torch's global generator."""
 
 from __future__ import annotations
 
@@ -19,9 +17,7 @@ LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 def light_unevenly(photo: Tensor) -> Tensor:
     """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
-
-    Detectors trained without it split leaves at the edge of a shadow.
-    """
+    Detectors trained without it split leaves at the edge of a shadow."""
     cells, sharpness = int(torch.randint(2, 9, ())), 2 ** (6 * draw(0, 1))
     rough = torch.randn(1, 1, cells, cells)
     field = torch.nn.functional.interpolate(rough, photo.shape[1:], mode="bicubic", align_corners=True)[0]
@@ -69,8 +65,7 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
     """Put one to three objects in front that are not leaves: tapes, labels, sticks, discs and hands. All but hands take
     a colour of the photo itself in half of the cases, so that green alone does not make a leaf.
 
-    Returns:
-        New tensors: photo (3, H, W) uint8 and layers (L, H, W) int, which are 0 where a thing hides an instance.
+    Returns new tensors: photo (3, H, W) uint8 and layers (L, H, W) int, which are 0 where a thing hides an instance.
     """
     height, width = photo.shape[1:]
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")

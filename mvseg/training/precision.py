@@ -1,8 +1,5 @@
-"""Whether a training run is faster in bfloat16: GPUs are asked, CPUs are timed.
-
-CPUs with AMX or AVX-512 instructions for bfloat16 take about half the time of float32 for most layers; those without
-take up to twelve times as long.
-"""
+"""Whether a training run is faster in bfloat16: GPUs are asked, CPUs are timed. CPUs with AMX or AVX-512 instructions
+for bfloat16 take about half the time of float32 for most layers; those without take up to twelve times as long."""
 
 from __future__ import annotations
 
@@ -41,10 +38,8 @@ def choose_bf16(config: TrainConfig, model: nn.Module, *, photos: list[Tensor], 
 
 
 def time_passes(model: nn.Module, photos: list[Tensor], targets: list[Target], *, is_bf16: bool) -> float:
-    """Seconds of CPU time for a forward and backward pass, the faster of two (the first one builds caches).
-
-    CPU time: on a shared machine, wall time also measures other processes.
-    """
+    """Seconds of CPU time for a forward and backward pass, the faster of two (the first one builds caches). On a shared
+    machine, wall time would also measure other processes."""
     trial, seconds = copy.deepcopy(model), []
     for _ in range(2):
         torch.manual_seed(0)  # the same anchors and RoIs for both precisions

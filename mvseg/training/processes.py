@@ -19,13 +19,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together.
-
-    Attributes:
-        rank: 0 for the first process, which writes the files.
-        count: number of processes.
-        device: where this process computes.
-    """
+    """This process among those that train together. The first has `rank` 0 and writes the files."""
 
     rank: int
     count: int
@@ -69,12 +63,9 @@ class Processes:
 def join_processes(device: str) -> Iterator[Processes]:
     """Join the other processes that torchrun started (gloo on CPUs, nccl on GPUs); alone without torchrun.
 
-    Args:
-        device: "cpu", "cuda" or "auto" (a GPU when there is one); with GPUs, each process of a machine takes its own.
-
-    Raises:
-        InputError: an unknown device, or one that this machine does not have; or environment variables of
-            torchrun that are not numbers.
+    `device` is "cpu", "cuda" or "auto" (a GPU when there is one); with GPUs, each process of a machine takes its own.
+    Raises InputError: an unknown device, or one that this machine lacks; environment variables of torchrun are no
+    numbers.
     """
     rank, count, local_rank = (_read_number(key) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     kind = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device

@@ -1,4 +1,4 @@
-"""The state of a training run: what it starts with, what a checkpoint holds, how a step changes it."""
+"""The state of a training run: its start, its checkpoints, and its change by a step."""
 
 from __future__ import annotations
 
@@ -28,11 +28,10 @@ logger = logging.getLogger(__name__)
 
 @dataclass
 class TrainingState:
-    """All that changes during a run, and what a checkpoint holds.
+    """All that changes during a run, and is in its checkpoints.
 
     Attributes:
         model: the detector itself, in train mode.
-        optimizer: over its trainable parameters.
         averaged: exponential moving average of the model, buffers included, in eval mode; or None.
         step: steps done since the start of the run.
         history: one record per epoch that was trained and evaluated.
@@ -59,11 +58,8 @@ def start_state(
 ) -> TrainingState:
     """The state that a run begins with, or resumes from if `config.resume` is set and there is a checkpoint.
 
-    `model` is trained in place of `build_detector(config.arch, ...)`.
-
-    Raises:
-        InputError: a checkpoint without `resume`, a damaged one, or one of another config or of other samples; see
-            `build_detector`.
+    `model` is trained in place of `build_detector(config.arch, ...)`. Raises InputError: a checkpoint without `resume`,
+    a damaged one, or one of another config or of other samples; see `build_detector`.
     """
     checkpoint = config.output / "checkpoint.pt"
     if checkpoint.is_file() and not config.resume:
@@ -90,11 +86,8 @@ def start_state(
 
 
 def take_heads(model: MaskRCNN, path: Path) -> None:
-    """Load everything but the backbone from another detector's weights.
-
-    Raises:
-        InputError: no such weights, or heads of other shapes.
-    """
+    """Load everything but the backbone from another detector's weights. Raises InputError: no such weights, or heads of
+    other shapes."""
     state, _ = read_weights(path)
     heads = {name: value.float() for name, value in state.items() if not name.startswith("backbone.")}
     body = {name: value for name, value in model.state_dict().items() if name.startswith("backbone.")}
@@ -105,11 +98,7 @@ def take_heads(model: MaskRCNN, path: Path) -> None:
 
 
 def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
-    """The content of a checkpoint; nothing in the file is executed.
-
-    Raises:
-        InputError: the file is not such a checkpoint.
-    """
+    """The content of a checkpoint; nothing in the file is executed. Raises InputError: it is no checkpoint."""
     try:
         content = torch.load(path, map_location=device, weights_only=True)
         content["model"], content["optimizer"], content["step"], content["config"]
@@ -119,11 +108,7 @@ def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
 
 
 def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
-    """Put a checkpoint's content into a fresh state.
-
-    Raises:
-        InputError: it was made with another config, or with other samples.
-    """
+    """Put a checkpoint's content into a fresh state. Raises InputError: it has another config, or other samples."""
     difference = config_difference(saved["config"], config_values(config))
     if difference:
         raise InputError(f"the checkpoint in {config.output} was made with another {difference}, expected the same")
@@ -154,10 +139,8 @@ def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -
 
 
 def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimizer:
-    """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out.
-
-    Each group of parameters has a "factor" of the learning rate beside torch's own options.
-    """
+    """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out. Each group of
+    parameters has a "factor" of the learning rate beside torch's own options."""
     groups = []
     for factor in sorted({1.0, config.backbone_lr}):
         for is_decayed in (True, False):
@@ -176,10 +159,8 @@ def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimi
 
 
 def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
-    """The rate of step 0 <= step < num_steps, see `TrainConfig.lr`, `schedule` and `warmup_steps`.
-
-    A function of the step: unlike torch's schedulers it has no state that a checkpoint must hold.
-    """
+    """The rate of step 0 <= step < num_steps, see `TrainConfig.lr`, `schedule` and `warmup_steps`. Unlike torch's
+    schedulers it has no state that a checkpoint must hold."""
     scale = config.batch_size / 16
     peak = config.lr * (scale if config.optimizer == "sgd" else math.sqrt(scale))
     warmup = min(config.warmup_steps, num_steps // 10)
@@ -195,11 +176,8 @@ def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
 
 @torch.no_grad()
 def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> bool:
-    """Clip the gradients, step the optimizer, follow with the average, count the step.
-
-    Returns:
-        False, and nothing is changed, when a gradient is not finite.
-    """
+    """Clip the gradients, step the optimizer, follow with the average, count the step. Returns False, and changes
+    nothing, when a gradient is not finite."""
     parameters = [parameter for group in state.optimizer.param_groups for parameter in group["params"]]
     norm = nn.utils.clip_grad_norm_(parameters, config.clip_norm or math.inf)
     if not bool(torch.isfinite(norm)):
@@ -217,9 +195,8 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
 def update_average(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
     """Move an average a share of 1 - `decay` towards the model: its parameters, and its buffers with them.
 
-    The running statistics of a live BatchNorm belong to the weights that they were measured with. Those of the model
-    describe its present weights, so they are averaged as these are, over the same steps, and not copied. Integers
-    (numbers of tracked batches) are copied.
+    The running statistics of a live BatchNorm belong to the weights that they were measured with, so they are averaged
+    over the same steps, and not copied. Integers (numbers of tracked batches) are copied.
     """
     here, there = (itertools.chain(each.parameters(), each.buffers()) for each in (averaged, model))
     for average, current in zip(here, there, strict=True):

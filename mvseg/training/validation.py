@@ -1,4 +1,4 @@
-"""Runs a detector over samples, as input of average precision."""
+"""Detections and truth of samples, as input of average precision."""
 
 from __future__ import annotations
 
@@ -15,12 +15,7 @@ from mvseg.training.data import SampleList, read_sample
 @torch.no_grad()
 def detect_and_label(model: MaskRCNN, samples: SampleList, indices: Iterable[int]) -> tuple[Annotations, Annotations]:
     """Truth and detections (with "score") of those samples as COCO annotations without ids; the index is `image_id`.
-
-    The model is in eval mode; photos go to the device of its parameters.
-
-    Raises:
-        InputError: a sample cannot be read.
-    """
+    The model is in eval mode; photos go to the device of its parameters. Raises InputError: a sample cannot be read."""
     device = next(model.parameters()).device
     truth: Annotations = []
     detections: Annotations = []

@@ -1,9 +1,9 @@
-"""What the views chose, as labels for the detector: self-training, with the other views as the judge of the labels.
+"""Labels for the detector from the masks that the views chose: self-training, judged by the other views.
 
 The paper feeds the ids of clusters back into the proposals of the same network (Sec. 3.2); this feeds them back into
-its weights, as self-training does with what a network is sure of (Xie et al., "Self-training with Noisy Student",
-CVPR 2020), and test-time training with the photos at hand (Sun et al., ICML 2020). There the network judges its own
-labels; here, photos of the same leaves from elsewhere do.
+its weights, as self-training does with labels that a network is sure of (Xie et al., "Self-training with Noisy
+Student", CVPR 2020), and test-time training with the photos at hand (Sun et al., ICML 2020). There the network judges
+its own labels; here, photos of the same leaves from elsewhere do.
 """
 
 from __future__ import annotations
@@ -54,17 +54,8 @@ class ViewLabels:
         return self.num_leaves >= CHOICE.least_leaves
 
     def in_photo(self, view: int, photo: np.ndarray, box: Box, *, size: tuple[int, int]) -> LabelledPhoto:
-        """The labels of one view in a part of its photo.
-
-        Args:
-            photo: (H, W, 3) uint8 RGB.
-            box: xyxy, the part.
-            size: (height, width) that the part is scaled to.
-
-        Returns:
-            The part with the labels that it shows. Ignored are pixels of doubtful masks, and those that have the colour
-            of a leaf, but for those of labels.
-        """
+        """The labels of one view in the part `box`, xyxy, of its photo (H, W, 3) uint8 RGB, scaled to `size` (height,
+        width). Ignored are pixels of doubtful masks, and leaf-coloured ones, but for those of labels."""
         x1, y1, x2, y2 = box
         part = torch.from_numpy(photo[y1:y2, x1:x2].copy()).permute(2, 0, 1)
         small = v2.functional.resize(part, list(size), antialias=True).permute(1, 2, 0).contiguous().numpy()
@@ -80,15 +71,12 @@ class ViewLabels:
 
 
 def label_views(masks: Masks, proposals: Masks, photos: ReadPhoto, *, probabilities: Mapping[int, float]) -> ViewLabels:
-    """Labels for a detector from the masks that the views chose.
+    """Labels for a detector from the masks that the views chose; too few to learn from unless they `are_enough`.
 
     Args:
         masks: D masks with ids; match scores are q, how likely a mask shows its leaf.
         proposals: R masks, everything else that a detector took for a leaf.
         probabilities: {id: P}, how likely each instance is a leaf; see `are_labels`.
-
-    Returns:
-        The labels; where they are not `are_enough`, there is too little to learn from.
     """
     is_label = are_labels(masks, probabilities)
     leaves = masks.select(is_label)
@@ -97,14 +85,11 @@ def label_views(masks: Masks, proposals: Masks, photos: ReadPhoto, *, probabilit
 
 
 def are_labels(masks: Masks, probabilities: Mapping[int, float]) -> Tensor:
-    """Select masks to learn from.
+    """Select masks to learn from, (D,) bool.
 
     A mask is a label when it likely shows its instance (match score of at least `SURE`), this is likely a leaf (P of at
     least `LIKELY`; an instance without a P is one), and a detector or a user found it there; or when the user made or
     confirmed it. Masks that surfaces of other views made (`Origin.OTHER_VIEWS`) are none.
-
-    Returns:
-        (D,) bool.
     """
     is_seen = masks.origin != Origin.OTHER_VIEWS
     unlikely = torch.tensor([each for each, chance in probabilities.items() if chance < LIKELY], dtype=torch.int64)

@@ -1,8 +1,7 @@
 """How well clusters of regions explain what all views show.
 
 A cluster explains a pixel of a region when some point of the pixel's ray shows members of the cluster in the other
-views: the hypotheses of `plane_sweep.py`, so that neither a volume nor a surface is needed. A region's own view never
-counts.
+views (hypotheses of `plane_sweep.py`): neither a volume nor a surface is needed. A region's own view never counts.
 """
 
 from __future__ import annotations
@@ -51,14 +50,10 @@ class ViewGains:
 
 @dataclass(frozen=True, eq=False)
 class ClusterScores:
-    """Scores of any clusters of the D regions of one sweep.
+    """Scores of any clusters of the D regions of one sweep, which are ordered by view.
 
     Results depend only on the members of a cluster and are cached by members: while the search moves some regions,
     unchanged clusters cost nothing. `replace` with a graph of other links keeps what is cached.
-
-    Attributes:
-        sweep: hypotheses of D regions, ordered by view.
-        graph: their epipolar weights.
     """
 
     sweep: PlaneSweep
@@ -69,8 +64,7 @@ class ClusterScores:
 
     @cached_property
     def evidence(self) -> Floats:
-        """(D, D) float32 evidence for (> 0) or against (< 0) a pair of regions being one instance, from its epipolar
-        weight."""
+        """(D, D) float32 epipolar evidence for (> 0) or against (< 0) a pair of regions being one instance."""
         return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + GAINS.prior).astype(np.float32)
 
     def scores(self, view: int, numbers: Ints) -> Floats:
@@ -80,12 +74,8 @@ class ClusterScores:
         nothing) / (views that the point lies in); a pixel takes the score of its best hypothesis, but at least -hidden;
         a region takes the mean of its pixels, or -hidden without pixels.
 
-        Args:
-            numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out. Regions of the view itself do
-                not count.
-
-        Returns:
-            (N, K) float32 in [-hidden, 1].
+        `numbers` (D,) are clusters in [0, K), -1 for regions to leave out; regions of the view itself do not count.
+        Returns (N, K) float32 in [-hidden, 1].
         """
         return self._region_scores(view, self._members_elsewhere(view, numbers))
 
@@ -94,12 +84,10 @@ class ClusterScores:
         return self._score_pixels(view, self._members_elsewhere(view, numbers))
 
     def coverages(self, clusters: Clusters) -> Floats:
-        """Pixels where clusters expect to be seen in each view, R(c, n).
+        """(K, D) float32: share of the pixels of cluster c in other views than n's whose best hypothesis shows n.
 
-        Returns:
-            (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best hypothesis shows
-            n. The best hypothesis is chosen without n's view; pixels whose best hypothesis scores below 0 do not count,
-            and hypotheses that tie share the pixel.
+        The best hypothesis is chosen without n's view; pixels whose best hypothesis scores below 0 do not count, and
+        hypotheses that tie share the pixel.
         """
         keys = [members.tobytes() for members in clusters.members]
         found = _look_up(self._coverages, keys, lambda new: self._cover(clusters, np.array(new)))
@@ -137,12 +125,8 @@ class ClusterScores:
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
     def gains(self, view: int, numbers: Ints, coverages: Floats) -> ViewGains:
-        """Gains of the regions of one view from joining the clusters of the other views.
-
-        Args:
-            numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out.
-            coverages: `coverages` of an earlier partition; newer clusters, which it does not have, cover nothing.
-        """
+        """Gains of the regions of one view from joining the clusters of the other views. `numbers` (D,) are clusters in
+        [0, K), -1 for regions to leave out; `coverages` may be older: newer clusters cover nothing."""
         here, members = self.sweep.bounds.regions(view), self._members_elsewhere(view, numbers)
         sizes = np.array([len(each) for each in members], np.int64)
         clusters = np.flatnonzero(sizes)
@@ -165,7 +149,6 @@ class ClusterScores:
         return members_of(elsewhere, int(numbers.max(initial=-1)) + 1)
 
     def _region_scores(self, view: int, members: list[Ints]) -> Floats:
-        """(N, C) float32: the scores of the view's regions in C clusters, cached."""
         keys, here = [(view, each.tobytes()) for each in members], self.sweep.bounds.regions(view)
         found = _look_up(self._scores, keys, lambda new: self._score_clusters(view, [members[k] for k in new]))
         return np.stack(found, 1) if found else np.zeros((here.stop - here.start, 0), np.float32)
@@ -181,11 +164,7 @@ class ClusterScores:
         return score
 
     def _score_pixels(self, view: int, members: list[Ints]) -> Floats:
-        """(C, P) float32: the scores of the view's pixels in C clusters without members in this view.
-
-        Hypotheses that show no member are not looked at: no view costs less than a hidden one, so that they score no
-        more than the least that a pixel has.
-        """
+        """(C, P) float32: the scores of the view's pixels in C clusters without members in this view."""
         pixels, here = self.sweep.bounds.pixels(view), self.sweep.bounds.hypotheses(view)
         least = np.float32(-COSTS.hidden)
         best = np.full((len(members), pixels.stop - pixels.start), least)
@@ -198,8 +177,7 @@ class ClusterScores:
         return best
 
     def _score_hypotheses(self, hypotheses: Ints, count: Ints, *, views: NDArray[np.uint64]) -> Floats:
-        """(R,) float32: the scores of hypotheses (R,) that show members of a cluster in `count` (R,) views, where
-        `views` (W, R) has a bit for each view in which the cluster has a region."""
+        """(R,) float32, from `count` (R,) views with members; `views` (W, R): bits of the cluster's views."""
         empty_views = self.sweep.empty_views
         missing = np.zeros(len(hypotheses), np.float32)
         for empty, shown in zip(empty_views, views, strict=True):
@@ -247,8 +225,7 @@ class ClusterScores:
         return (covered / np.maximum(num_pixels, 1e-9)[:, sweep.view_index]).astype(np.float32)
 
     def _may_be_best(self, hypotheses: Ints, score: Floats) -> NDArray[np.bool_]:
-        """(R,) whether a hypothesis may be the best of its pixel when one view does not count: that view gives 1 at
-        most, and costs `missing` or `absent` at most."""
+        """(R,) may it be its pixel's best without one view, which gives 1 or costs `missing` or `absent` at most?"""
         num_inside, pixel = self.sweep.num_inside[hypotheses], self.sweep.pixel[hypotheses]
         total, others = score * num_inside, np.maximum(num_inside - 1, 1)
         most = np.maximum(score, (total + max(COSTS.missing, COSTS.absent)) / others)
@@ -257,7 +234,6 @@ class ClusterScores:
         return most + SEARCH.slack >= np.repeat(best, np.diff(start, append=len(pixel)))
 
     def _score_own(self, clusters: Clusters, asked: Ints) -> Floats:
-        """(D,) score of each region in its own cluster, for those in the clusters `asked`."""
         sweep, hidden = self.sweep, COSTS.hidden
         best = np.full(len(sweep.pixel_region), -hidden)
         for hypotheses, score, _ in self._own_hypotheses(clusters, asked):
@@ -268,8 +244,7 @@ class ClusterScores:
         return np.bincount(sweep.pixel_region, best, len(clusters.ids)) / np.maximum(counts, 1)
 
     def _own_hypotheses(self, clusters: Clusters, asked: Ints) -> Iterator[tuple[Ints, Floats, NDArray[np.bool_]]]:
-        """The hypotheses (R,) on rays of the regions of the clusters `asked`, some pixels at a time; their scores (R,)
-        in the region's own cluster, and (R, V) which views show it."""
+        """Blocks of hypotheses (R,) on rays of clusters `asked`, scores in their own cluster, and views (R, V)."""
         sweep = self.sweep
         is_asked = np.zeros(len(clusters), bool)
         is_asked[asked] = True
@@ -293,12 +268,12 @@ def best_elsewhere(
         gain: (R, V) float32, what each view adds to the score of whole runs of hypotheses; their sum over the number of
             views that the point lies in is the score.
         is_inside: (R, V) whether the point lies in that view.
-        pixel: (R,) int64, the pixel of each, ascending.
-        own_view: (R,) int64, the view of that, for which there is no answer.
+        pixel: (R,) int64, ascending.
+        own_view: (R,) int64, the view of the pixel, for which there is no answer.
 
     Returns:
-        Three arrays with one entry per best hypothesis: the hypothesis, the view left out, and the hypothesis's share
-        of the pixel: hypotheses that tie within 1e-6 share it. A pixel whose best hypothesis scores below 0 has none.
+        Per best hypothesis: the hypothesis, the view left out, and its share of the pixel: hypotheses that tie within
+        1e-6 share it. A pixel whose best hypothesis scores below 0 has none.
     """
     start = run_starts(pixel)
     lengths = np.diff(start, append=len(pixel))
@@ -316,7 +291,6 @@ def best_elsewhere(
 def _look_up(
     cache: dict[Key, Floats], keys: list[Key], compute: Callable[[list[int]], Iterable[Floats]]
 ) -> list[Floats]:
-    """Values of the keys from the cache; `compute` gives those at the places of missing keys."""
     new = [place for place, key in enumerate(keys) if key not in cache]
     if new:
         cache.update(zip((keys[place] for place in new), compute(new), strict=True))

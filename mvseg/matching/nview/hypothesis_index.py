@@ -1,4 +1,4 @@
-"""Which hypotheses name which regions, and sets of views as bits."""
+"""Index of hypotheses by the regions that they name, and sets of views as bits."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class HypothesesOfRegions:
-    """For each of D regions, which of R hypotheses name it: hypotheses are found without looking at those that do not.
+    """Index of R hypotheses by the D regions that they name.
 
     Attributes:
         hypotheses: int32, the hypotheses of region 0, then those of region 1, ...
         offsets: D + 1 numbers: region d is named by `hypotheses[offsets[d]:offsets[d + 1]]`.
-        num_hypotheses: R.
     """
 
     hypotheses: NDArray[np.int32]
@@ -26,11 +25,8 @@ class HypothesesOfRegions:
     num_hypotheses: int
 
     def count(self, clusters: list[Ints]) -> tuple[Ints, Ints, Ints]:
-        """How many views show a member of each of C clusters, in the hypotheses in which any does.
-
-        Returns:
-            Three int64 arrays with an entry per cluster and hypothesis, in this order: cluster, hypothesis, views.
-        """
+        """Count the views that show a member of each of C clusters. Returns three int64 arrays with an entry per
+        cluster and hypothesis in which any view does, in this order: cluster, hypothesis, views."""
         parts = [
             [self.hypotheses[self.offsets[region] : self.offsets[region + 1]] for region in members.tolist()]
             for members in clusters

@@ -22,8 +22,7 @@ Ints = NDArray[np.int64]
 
 
 def initial_partitions(sweep: PlaneSweep, graph: ViewGraph) -> list[Clusters]:
-    """One or, with few views, two partitions of D regions to start the search from. Of the graph, only what must stay
-    together and apart counts."""
+    """Start the search: one or, with few views, two partitions of D regions. Weights of the graph do not count."""
     history = em_affinities(sweep, graph)
     return [
         link_average(replace(graph, weights=history[iteration].astype(np.float64)), stop)
@@ -37,12 +36,8 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
     E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
     regions that they name (the pixel's own included), less `EM.empty_cost` for views that show nothing. With many
     views, `EM.views` of them are compared with each other. M step: the affinity of region n to m is the belief in
-    hypotheses with m, averaged over the pixels of n, and made symmetric. What the user knows of two regions is 1 or 0
-    after each step: hypotheses that show linked regions are believed, and with them all else that these show.
-
-    Args:
-        sweep: hypotheses of D regions.
-        graph: what must stay together and apart; its weights do not count. None: nothing.
+    hypotheses with m, averaged over the pixels of n, and made symmetric. Links of the graph are 1 or 0 after each step:
+    hypotheses that show linked regions are believed, and with them all else that these show. Its weights do not count.
 
     Returns:
         The affinity after each iteration: (D, D) float32 in [0, 1], symmetric, 0 within a view.
@@ -78,7 +73,6 @@ def _symmetric(A: Floats) -> Floats:
 
 
 def _spread_pixels(sweep: PlaneSweep) -> NDArray[np.bool_]:
-    """(Q,) the pixels that EM uses: at most `EM.pixels` of each region, fewer with many views."""
     most = max(1, round(EM.pixels * min(1, SWEEP.plenty / sweep.num_views)))
     counts = np.bincount(sweep.pixel_region, minlength=len(sweep.view_index))
     rank = np.arange(len(sweep.pixel_region)) - np.searchsorted(sweep.pixel_region, sweep.pixel_region)
@@ -88,16 +82,7 @@ def _spread_pixels(sweep: PlaneSweep) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class _ComparedHypotheses:
-    """R hypotheses and the regions whose affinity to each other says how likely each hypothesis is.
-
-    Attributes:
-        labels: (N, R) int64, the regions of each hypothesis, the pixel's own first; hypotheses with the most regions
-        first.
-        num_labels: (R,) how many of the N entries hold a region.
-        order: (R,) the place of each hypothesis in the sweep's order.
-        num_empty: (R,) compared views that show no region.
-        num_inside: (R,) compared views that the point lies in.
-    """
+    """R hypotheses and the regions whose affinity to each other says how likely each hypothesis is."""
 
     labels: Ints
     num_labels: Ints
@@ -120,7 +105,7 @@ class _ComparedHypotheses:
 
 
 def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
-    """The hypotheses, with what `EM.views` views show at most: spread evenly, starting with the pixel's own."""
+    """The hypotheses, with at most `EM.views` views, spread evenly, starting with the pixel's own."""
     num, owner = len(sweep.view_index), sweep.pixel_region[sweep.pixel[hypotheses]]
     labels = sweep.labels[hypotheses]
     if sweep.num_views > EM.views:

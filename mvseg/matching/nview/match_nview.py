@@ -35,10 +35,9 @@ def match_nview(
     *,
     residual_px: int | None = None,
 ) -> Matching:
-    """Match the regions of V >= 2 views by what all views show.
+    """Match D regions of V >= 2 views, in any order, by what all views show.
 
     Args:
-        regions: D regions in V views, in any order.
         graph: the epipolar weights of the regions, and their links.
         residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
 
@@ -73,7 +72,6 @@ class FoundClusters:
     Attributes:
         clusters: those of one region included.
         pairwise: likewise, from the weights alone, without links.
-        scores: of the hypotheses.
         residual_px: see `select_dilation`.
         method: "nview", or "one-per-view" where the clusters are from the weights alone.
     """
@@ -92,13 +90,8 @@ def find_clusters(
     *,
     residual_px: int | None = None,
 ) -> FoundClusters:
-    """The clusters that explain all views best, or where hypotheses explain too little, those from the weights alone.
-
-    Args:
-        regions: D regions, ordered by view.
-        graph: their epipolar weights, and their links.
-        residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
-    """
+    """The clusters of D regions, ordered by view, that explain all views best, or where hypotheses explain too little,
+    those from the weights alone. `residual_px`: see `match_nview`."""
     pairwise = one_per_view_clusters(graph.without_links)
     scores, residual_px = select_dilation(regions, cameras, graph, pairwise=pairwise, residual_px=residual_px)
 
@@ -114,7 +107,6 @@ def find_clusters(
 
 
 def _free_linked(clusters: Clusters, graph: ViewGraph) -> Clusters:
-    """Clusters without the nodes that links name: each of these begins by itself."""
     return Clusters.of(np.where(graph.is_linked, len(clusters) + graph.node, clusters.ids))
 
 
@@ -129,7 +121,7 @@ def select_dilation(
     """The scores of the plane sweep whose label maps are dilated by the reprojection error, and that error in pixels.
 
     The error is the least dilation with which the hypotheses explain the pairwise clusters nearly as well as with any;
-    a few rays of each region tell that of all but the first. A `residual_px` that is known is not estimated.
+    all dilations but the first are tried on a few rays of each region. A given `residual_px` is not estimated.
     """
 
     def score(sweep: PlaneSweep) -> ClusterScores:
@@ -149,6 +141,5 @@ def select_dilation(
 
 
 def _final_numbers(ids: torch.Tensor) -> torch.Tensor:
-    """(K,) int64: number of each instance by its first region; -1 for one with a single region."""
     _, first = np.unique(ids.numpy(), return_index=True)
     return Clusters.of(ids.numpy()).drop_singletons().instance_ids()[torch.from_numpy(first)]

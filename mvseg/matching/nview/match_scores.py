@@ -4,10 +4,10 @@ Two logistic regressions, fitted on simulated development plants of 3 to 20 view
 scored about 0.8, about 80 % are right there (`benchmarks/confidence.py`). A region is right when its cluster is the
 largest one of its leaf, and its leaf is the most frequent one of its cluster.
 
-The first regression looks at the region alone, and knows exact poses only. Where poses are wrong, nearly every region
-finds some cluster that explains it well. The scene tells: its regions are less sure on average, and the clusters are
-others than those from the epipolar weights alone. So the second one, fitted with wrong poses, too, decides how far the
-regions of this scene are to be believed.
+The first regression looks at the region alone, and knows exact poses only. With wrong poses, nearly every region finds
+some cluster that explains it well, but the scene tells: its regions are less sure on average, and their clusters differ
+from those of the epipolar weights. So the second one, fitted with wrong poses, too, decides how far to believe the
+regions of this scene.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ class IdEvidence:
         num_partners: (D,) int64, members of the cluster in other views; 0 for a region that is alone.
         num_fragments: (D,) int64, members of the cluster in the region's own view, itself included.
         agreement: (D,) share of the regions of other views in this cluster or in the pairwise one that are in both.
-        num_views: V.
     """
 
     score: Floats
@@ -110,11 +109,8 @@ def features(evidence: IdEvidence) -> Floats:
 
 
 def scene_features(evidence: IdEvidence) -> Floats:
-    """(D, 5): 1, log odds of the region, log odds of the scene, their product, and the agreement with the clusters of
-    weights alone.
-
-    Log odds are those of the first regression, for the region and for its mean over the matched regions.
-    """
+    """(D, 5): 1, log odds of the region, log odds of the scene, their product, and the agreement with the pairwise
+    clusters. Log odds are of the first regression, for the region and for its mean over the matched regions."""
     sure = 1 / (1 + np.exp(-(features(evidence) @ list(REGION.values()))))
     is_matched = evidence.num_partners > 0
     mean = float(sure[is_matched].mean()) if is_matched.any() else 0.0

@@ -1,8 +1,8 @@
 """Several masks of one photo in one cluster: pieces of one leaf, or a leaf and a stranger.
 
-A leaf that only one photo shows fits somewhere all the same: what lies along its rays is another leaf. So a second mask
-of one photo must be as likely a piece as this scene's masks are in pieces, and explained by the cluster nearly as well
-as the first. A logistic regression says how likely; `python benchmarks/pieces.py` fits it.
+A leaf that only one photo shows fits another leaf along its rays. So a second mask of one photo must be as likely a
+piece as this scene's masks are in pieces, and explained by the cluster nearly as well as the first. A logistic
+regression, fitted by `python benchmarks/pieces.py`, says how likely.
 """
 
 from __future__ import annotations
@@ -23,12 +23,8 @@ PIECE = {"always": 1.28, "other pieces": 0.84, "score": 3.69, "coverage": 4.37, 
 
 
 def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Floats]:
-    """Strangers leave their clusters and are alone.
-
-    Returns:
-        The clusters, those of one region included. What the user joined stays. And (D,) float64: how likely each region
-        that is still a piece shows the leaf of its cluster; 1 for all others.
-    """
+    """Take strangers out of their clusters, so that they are alone; links of the user stay. Returns the clusters, those
+    of one region included, and (D,) float64: P(a remaining piece shows the leaf of its cluster); 1 for all others."""
     chance = np.ones(len(clusters.ids))
     rows, features = piece_features(scores, clusters)
     chance[rows] = expit(features @ list(PIECE.values()))

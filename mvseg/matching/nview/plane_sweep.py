@@ -1,8 +1,7 @@
-"""What the other views show along the ray of a pixel: a plane sweep of label maps.
+"""Labels of the other views along the ray of a pixel: a plane sweep of label maps.
 
 Every hypothesis about a pixel's depth predicts one label per view: the point projects onto this region, onto no region,
-or outside the image. Most depths predict the same labels as their neighbours, so that few distinct hypotheses are left
-per pixel; everything later works on those.
+or outside the image. Most depths predict the same labels as their neighbours, so few distinct ones remain per pixel.
 
 This is the one border between torch and NumPy in the N-view matcher: regions and cameras come in as tensors on any
 device, labels and everything from the sweep on are NumPy (which compares and looks up small integers much faster).
@@ -66,7 +65,6 @@ class PlaneSweep:
         pixel_region: (Q,) int64, ordered: the region of each pixel; some pixels have no hypothesis.
         pixel_xy: (Q, 2) float32, centres.
         view_index: (D,) int64, ordered.
-        num_views: V.
     """
 
     labels: NDArray[np.integer]
@@ -108,15 +106,11 @@ class PlaneSweep:
 
 
 def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1) -> PlaneSweep:
-    """Sweep the rays of all regions through the label maps of all other views.
+    """Sweep the rays of all regions, ordered by view, through the label maps of all other views.
 
-    Args:
-        regions: D regions ordered by view (int64 `view_index` must not decrease).
-        dilation_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
-
-    Returns:
-        The sweep. A hypothesis is kept when at least one view shows a region, at most half of the views that the point
-        lies in show none (one always may), and no neighbour on the ray shows the same regions and more.
+    Regions grow by `dilation_px` into unlabelled pixels; about the expected reprojection error. A hypothesis is kept
+    when at least one view shows a region, at most half of the views that the point lies in show none (one always may),
+    and no neighbour on the ray shows the same regions and more.
     """
     return next(sweep_dilated(regions, cameras, dilations=(dilation_px,)))
 
@@ -149,7 +143,7 @@ def rays_per_region(num_views: int) -> int:
 
 @torch.inference_mode()
 def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> PlaneSweep:
-    """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,); `title` is that of the progress bar."""
+    """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,)."""
     num_views = len(label_maps.maps)
     pixels, inverse = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
     labels = [np.zeros((0, num_views), label_maps.maps[0].numpy().dtype)]
@@ -182,8 +176,7 @@ def _padded_labels(regions: Regions, view: int, size: list[int]) -> Tensor:
 
 
 def _dilate(padded: Tensor, num_px: int) -> None:
-    """Grow the regions of a padded label map into EMPTY pixels by so many pixels, in place. A pixel beside several
-    takes the one below, else above, to the right, to the left."""
+    """Grow the regions of a padded label map into EMPTY pixels, in place; from below first, then above, right, left."""
     flat, row = padded.numpy().ravel(), padded.shape[1]
     beside, tag = (row, -row, 1, -1), np.empty(flat.shape, np.int32)
     is_region, is_empty = flat >= 0, flat[row:-row] == EMPTY
@@ -202,10 +195,7 @@ def _dilate(padded: Tensor, num_px: int) -> None:
 
 
 def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
-    """x1, y1, x2, y2 of all regions of a padded label map in pixels; None without any.
-
-    Where a region touches the border of the image its instance may continue, so the box extends to infinity there.
-    """
+    """x1, y1, x2, y2 of all regions of a padded label map; infinite where one touches the border; None without any."""
     inner = labels.numpy()[1:-1, 1:-1] >= 0
     height, width = inner.shape
     left, top, wide, high = cv2.boundingRect(inner.view(np.uint8))
@@ -219,13 +209,7 @@ def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class _LabelMaps:
-    """The label maps of V views, on the CPU, ready to be looked up along rays.
-
-    Attributes:
-        cameras: V cameras.
-        maps: V padded label maps, see `_padded_labels`.
-        boxes: V boxes of their regions, see `_label_box`.
-    """
+    """The label maps of V views, padded, on the CPU, with boxes of their regions, ready to be looked up along rays."""
 
     cameras: Cameras
     maps: list[Tensor]
@@ -252,8 +236,7 @@ class _LabelMaps:
         return kept // SWEEP.depths, labels.take(kept, 1), inverse.numpy().ravel()[kept]
 
     def _project_rays(self, view: int, xy: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
-        """A point at inverse depth w along a ray projects to base + w * offset, homogeneous: bases (O, P, 3) float32,
-        offsets (O, 3) float64."""
+        """Bases (O, P, 3) float32, offsets (O, 3) float64: inverse depth w projects to base + w * offset."""
         cameras = self.cameras
         ones = torch.ones(len(xy), 1).to(xy)
         rays = torch.cat((xy, ones), 1).double() @ cameras.world_from_px[view].T
@@ -309,8 +292,7 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
 
 
 def _join_equal(pixel: Ints, labels: NDArray[np.integer], inverse: Floats) -> tuple[Ints, NDArray[np.integer], Floats]:
-    """Join runs of equal hypotheses on a ray; discard hypotheses that equal a neighbour's but lack some of its regions.
-    The hypotheses are the columns of `labels` (V, I): neighbours are compared view by view, many of them at a time."""
+    """Join runs of equal columns of `labels` (V, I) on a ray; drop those that only lack regions of a neighbour."""
     if not len(pixel):
         return pixel, labels, inverse
     is_new = np.append(True, (labels[:, 1:] != labels[:, :-1]).any(0) | (pixel[1:] != pixel[:-1]))

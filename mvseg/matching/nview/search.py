@@ -1,8 +1,8 @@
 """The search for the partition that explains all views best.
 
 Each start is refined by one assignment problem per view, as in `one_per_view.py`, but decided by how well the clusters
-explain the regions in all views. A left-over region may join a cluster that has a region in its view already, if the
-cluster covers it too: fragments of an instance that the segmenter split, or that a stem in front of it divides.
+explain the regions in all views. A remaining region may join a cluster that has a region in its view already, if the
+cluster covers it too: fragments of an instance that the segmenter or a stem in front of it divides.
 """
 
 from __future__ import annotations
@@ -25,17 +25,11 @@ Ints = NDArray[np.int64]
 
 
 def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[Clusters] = ()) -> Clusters:
-    """The best partition that refinement finds from one start, or, with few views, two.
+    """The best partition that refinement finds from one start, or, with few views, two. Links hold all the way.
 
-    What the graph of the scores says must stay together, or apart, does so all the way.
-
-    Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
-    weights decide better about slivers that few views show.
-
-    Args:
-        scores: of D regions in three views or more.
-        pairwise: clusters from the weights alone, those of one region included, as in all partitions here.
-        more_starts: partitions to start from as well.
+    Clusters from the weights alone (`pairwise`, those of one region included, as in all partitions here) are kept when
+    they are worth nearly as much: then the masks are sound, and the weights decide better about slivers that few views
+    show. The scores are of three views or more; `more_starts` are partitions to start from as well.
     """
     refined = []
     for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
@@ -49,12 +43,8 @@ def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[C
 
 
 def refine_clusters(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False) -> Clusters:
-    """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
-
-    Args:
-        clusters: to start from.
-        join_fragments: left-over regions may join a cluster that has a region in their view already.
-    """
+    """Re-assign the regions of one view after another to the clusters of the others, until nothing changes. With
+    `join_fragments`, remaining regions may join a cluster that has a region in their view already."""
     order = view_order(scores.graph)
     for _ in range(SEARCH.max_sweeps):
         ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
@@ -79,10 +69,9 @@ def refine_clusters(scores: ClusterScores, clusters: Clusters, *, join_fragments
 def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     """Dissolve clusters that few views show into larger ones that cover their regions.
 
-    Fragments of over-segmented masks, and masks that are merged with something else, find each other across views and
-    form spurious instances. A region of such a cluster joins the larger one that covers most of it and explains some of
-    it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
-    dissolved, and never what the user has linked.
+    Fragments of over-segmented masks, and merged masks, find each other across views and form spurious instances. A
+    region of such a cluster joins the larger one that covers most of it and explains some of it, if there is one,
+    whether or not that one has a region in the view already. Linked regions stay, and all with fewer than four views.
     """
     sweep = scores.sweep
     is_shown = np.zeros((len(clusters), sweep.num_views), bool)
@@ -102,8 +91,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
 
 
 def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) -> ViewGains:
-    """Gains of the movers from joining the clusters of the other regions; -inf where they cannot. Of a node of several
-    regions, gains are summed up, scores and coverages are means."""
+    """Gains of the movers from joining the other regions' clusters, summed over nodes; -inf where they cannot."""
     graph, rest = scores.graph, ids.copy()
     rest[movers.rows] = -1
     numbers = np.unique(rest[rest >= 0])
@@ -122,7 +110,6 @@ def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) 
 
 
 def _join_fragments(chosen: Ints, gains: ViewGains, *, is_free: NDArray[np.bool_]) -> Ints:
-    """Put left-over regions that are free (N,) to join into taken clusters that cover them and explain them well."""
     is_assigned = chosen < len(gains.clusters)
     holder_score = np.full(len(gains.clusters), np.inf)
     holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]

@@ -1,8 +1,8 @@
 """The fit of a tube to the outlines of its masks: reweighted Gauss-Newton, as for leaf patches.
 
 Both sides of the tube, and its two ends, are compared with the edges of the masks along the image normals. Where the
-mask ends because another instance or the frame hides the rest, its edge only says that the tube reaches so far. Masks
-that show a part of the stem shorten it little: an end inside of a mask counts more than one beyond it.
+mask ends because another instance or the frame hides the rest, the tube only has to reach its edge. Masks that show a
+part of the stem shorten it little: an end inside of a mask counts more than one beyond it.
 """
 
 from __future__ import annotations
@@ -28,17 +28,14 @@ ENDS = [0, TUBE.rows - 1]  # of the places at which a tube is compared
 
 
 def fit_tube(masks: MaskStack, start: Floats | None = None, *, mask_sd_px: float = 0.0) -> Tube:
-    """Fit a tube to the masks of one stem.
+    """Fit a tube to the masks of one stem, in two views or more. The tube is in the world of `masks`; where there is
+    none, it says why.
 
     Args:
-        masks: of two views or more.
-        start: (P, 3) points roughly along the axis, from end to end, as the midrib of a patch; None: it is looked for
-            in the hull of the masks.
-        mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large, pixels of
-            the photos; 0 for exact ones.
-
-    Returns:
-        The tube, in the world of `masks`; where there is none, why.
+        start: (P, 3) points roughly along the axis, from end to end, as the midrib of a patch; None: the axis is looked
+            for in the hull of the masks.
+        mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large, pixels of the
+            photos; 0 for exact ones.
     """
     if len(masks) < 2:
         return Tube.none(masks.views, "seen in one view only")
@@ -83,8 +80,8 @@ def fit_tube(masks: MaskStack, start: Floats | None = None, *, mask_sd_px: float
 
 
 def believe_offsets(measured: Floats, sd_px: float) -> Floats:
-    """(S,) by how much the mask of each view is too large, from offsets (S,), NaN for nothing: the part that is
-    likely where masks differ by this standard deviation."""
+    """(S,) pixels by which the mask of each view is likely too large, from measured offsets (S,), NaN for none: the
+    part that is likely where masks differ by this standard deviation."""
     finite = measured[np.isfinite(measured)]
     if not len(finite):
         return np.zeros(len(measured))
@@ -194,10 +191,8 @@ def tube_distances(masks: MaskStack, axis: Floats, radii: Floats, *, reach: floa
 
 
 def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats) -> Floats:
-    """(S,) IoU of a tube and the mask in each view, where nothing else hides them.
-
-    It is drawn as much too large or small as the mask of each view is, by `offsets` (S,) pixels.
-    """
+    """(S,) IoU of a tube and the mask in each view, where nothing else hides them. The tube is drawn too large or small
+    by `offsets` (S,) pixels, as the mask of each view is."""
     u = tube_places(TUBE.rows)
     middle = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
     half = (middle.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * middle.normals
@@ -245,17 +240,14 @@ def _first_radius(masks: MaskStack, axis: Floats) -> float:
 
 
 def _pixel_size(masks: MaskStack) -> float:
-    """World units per pixel at the origin of the masks' world, median over the views."""
     depth = np.maximum(masks.px_from_world[:, 2, 3], 1e-9)
     rows = masks.px_from_world[:, :2, :3]
     return float(np.median(depth / np.maximum(np.linalg.norm(rows, axis=2).max(1), 1e-12)))
 
 
 def apparent_widths(masks: MaskStack, axis: Floats) -> tuple[Floats, Floats]:
-    """(S, M) how wide each view shows what is around an axis (6, 3), at M places along it: world units, and pixels.
-
-    NaN where nothing of the mask is there, another instance borders or interrupts it, or the view looks along the axis.
-    """
+    """(S, M) widths of the mask in each view around an axis (6, 3), at M places along it: world units, and pixels. NaN
+    where nothing of the mask is there, another instance borders or interrupts it, or the view looks along the axis."""
     u = tube_places(TUBE.rows + 2)[1:-1]
     ribbon = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
     half = max(masks.size) // 2
@@ -279,8 +271,7 @@ def _weigh(distances: TubeDistances, scale_px: float) -> Floats:
 
 
 def _prior(state: _State) -> tuple[Floats, Floats]:
-    """A (E, 21) and b (E,) about the present coefficients: stems bend evenly, places on them are even, and radii change
-    slowly."""
+    """A (E, 21) and b (E,) about the coefficients: stems bend evenly, places are even, radii change slowly."""
     bend = np.kron(np.diff(np.eye(AXIS), 3, axis=0), np.eye(3)) / TUBE.bend_sd
     u = tube_places(AXIS + 1)
     speeds = np.diff(spline_basis(u, AXIS), axis=0) * AXIS

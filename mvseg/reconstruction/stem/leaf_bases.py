@@ -1,7 +1,7 @@
 """Bases of leaves, and the axis that their petioles, seen from the blades, point back to.
 
-A petiole leaves the blade against the direction in which its midrib begins. Where no mask shows the stem, the curve
-near which most of these rays pass is its axis. Which end of a leaf is its base follows: the one that is nearer.
+A petiole leaves the blade against the direction in which its midrib begins. Where no mask shows the stem, its axis is
+the curve near which most of these rays pass. The base of a leaf is the end nearer to it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,6 @@ class LeafBases:
 
     @staticmethod
     def join(first: LeafBases, second: LeafBases) -> LeafBases:
-        """Join two sets of bases."""
         names = [field.name for field in fields(LeafBases)]
         return LeafBases(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
 
@@ -104,14 +103,12 @@ class BaseAxis:
 
 
 def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tuple[BaseAxis, ...]:
-    """Find the axes that the leaves of a plant point back to: that of the most leaves first.
+    """Find the axes that the leaves of a plant point back to, one for each stem, that of the most leaves first; ()
+    where fewer than `AXES.near_share` of the leaves point to any, as in a rosette.
 
     Args:
         surfaces: {instance id: surface} of leaves.
         up: (3,) unit vector; None: not known. Then the side to which most leaves rise is above.
-
-    Returns:
-        One axis for each stem; () where fewer than `AXES.near_share` of the leaves point to any, as in a rosette.
     """
     first, second = find_ends(surfaces)
     is_free, axes = np.ones(len(first), bool), []
@@ -125,8 +122,7 @@ def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tup
 
 
 def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAxis | None:
-    """The axis of the most leaves, of which `first` and `second` are both ends; None where these are too few, or their
-    nodes lie hardly farther apart along it than their petioles are long."""
+    """The axis of the most leaves; None where they are few, or nodes hardly farther apart than petioles are long."""
     size = float(np.median(first.lengths))
     starts = _start_lines(first, second, up, size=size)
     fits = [_fit_axis(first, second, start, size=size) for start in starts]
@@ -198,10 +194,7 @@ def _nearest_to_rays(points: Floats, ahead: Floats) -> Floats:
 
 
 def _cost(bases: LeafBases, nodes: Floats, distances: Floats, size: float) -> float:
-    """Cost of an axis: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3).
-
-    Leaves in two rows point to any line between the rows: petioles are alike on both sides.
-    """
+    """Cost of an axis: robust distances (N,) of rays, and lengths of petioles from nodes (N, 3)."""
     squares = (distances / (AXES.near * size)) ** 2
     petioles = np.linalg.norm(bases.points - nodes, axis=1) / bases.lengths
     return float((squares / (1 + squares) + AXES.petiole_square * petioles**2).sum())
@@ -218,12 +211,7 @@ def _lean_cost(ahead: Floats, up: Floats | None, num_leaves: int) -> float:
 def _fit_axis(
     first: LeafBases, second: LeafBases, line: tuple[Floats, Floats], *, size: float
 ) -> tuple[Floats, LeafBases, Floats, Floats, Floats]:
-    """Rounds of: which end is the base, where its ray is nearest to the curve, and the curve through these places.
-
-    Returns:
-        (P, 3) points of the curve, the bases, their nodes (N, 3), their rays' distances (N,) from the curve and places
-        (N,) along it.
-    """
+    """Choose ends and refit in turn: curve (P, 3), bases, nodes (N, 3), rays' distances (N,), places (N,)."""
     middle, direction = line
     direction = direction / np.linalg.norm(direction)
     reach = max(float(np.ptp((first.points - middle) @ direction)), size)
@@ -307,8 +295,7 @@ def _look_back(bases: LeafBases, curve: Floats) -> Floats:
 
 
 def _nearest_on_rays(bases: LeafBases, back: Floats, curve: Floats, t: Floats) -> tuple[Floats, Floats, Floats]:
-    """Places (N,) on rays that are nearest to a curve (P, 3), among t (N, R) in lengths of the leaves; their distances
-    (N,), and their places (N,) along the curve."""
+    """Places (N,) on rays, among t (N, R) in leaf lengths; distances (N,) and places (N,) on the curve (P, 3)."""
     rays = bases.points[:, None] + (t * bases.lengths[:, None])[..., None] * back[:, None]
     starts, steps = curve[:-1], np.diff(curve, axis=0)
     size = np.maximum((steps**2).sum(1), 1e-300)

@@ -1,6 +1,6 @@
 """The axis of a stem in photos: the cheapest path through thin cells from the lowest leaf to the highest one.
 
-Leaves are joined to it by the cheapest paths from anywhere on their surfaces: petioles. So a midrib that runs the wrong
+Petioles, the cheapest paths from anywhere on the leaves' surfaces, join leaves to it. So a midrib that runs the wrong
 way, as on leaves that are wider than long, does no harm.
 """
 
@@ -40,14 +40,8 @@ class StemPath:
 
 
 def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None:
-    """Find the line of cells through which the cheapest paths between the leaves run.
-
-    Args:
-        leaves: {leaf: (P, 3) points on its surface}.
-
-    Returns:
-        None where fewer than `THIN.least_leaves` leaves are joined, or their paths share no line.
-    """
+    """Find the line of cells through which the cheapest paths between the `leaves` {leaf: (P, 3) points on its surface}
+    run. None where fewer than `THIN.least_leaves` leaves are joined, or their paths share no line."""
     if len(cells.points) < THIN.least_steps or len(leaves) < THIN.least_leaves:
         return None
     graph = _Graph.of(cells, leaves)
@@ -65,8 +59,7 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
 
 
 def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
-    """(cells,) how much each cell is a stem's: of the cheapest paths from a leaf to all others, how many lead through
-    it, or do not, whichever are fewer; 0 for petioles, which a single one uses."""
+    """(cells,) of the cheapest paths between leaves, how many lead through a cell, or do not, the fewer."""
     _, before = graph.cost_from(root)
     used = np.zeros(len(before), np.int64)
     joined = [leaf for leaf, index in graph.leaf_index.items() if before[index] >= 0]
@@ -78,10 +71,7 @@ def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
 
 
 def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> tuple[Floats, float, float] | None:
-    """A smooth line along the cells of a trunk, its median miss and mean share; None where they lie on none.
-
-    Of all lines through two of the cells the one that most of them are near, and then a parabola.
-    """
+    """A smooth line along the cells of a trunk, its median miss and mean share; None where they lie on none."""
     members = np.flatnonzero(trunk > 0)
     if len(members) < THIN.least_steps:
         return None
@@ -147,7 +137,6 @@ def trace_path(before: NDArray, end: int) -> list[int]:
 
 
 def _spread_cells(cells: ThinCells) -> NDArray:
-    """(M,) of the cells in each cube of a few cells, the surest one."""
     cube = np.floor((cells.points - cells.points.min(0)) / (THIN.cube_cells * cells.size)).astype(int)
     order = np.lexsort((np.arange(len(cube)), -cells.share))
     _, first = np.unique(cube[order], axis=0, return_index=True)

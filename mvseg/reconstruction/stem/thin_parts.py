@@ -1,7 +1,7 @@
 """Thin parts of a plant in photos, and the cells of space that the views agree to show them in.
 
-Stems and petioles are green or brown, as dark as soil or bright: nothing about their colour is sure but that it differs
-from what is around them, on both sides. Leaves hide: where a mask of one is, nothing is known.
+Stems and petioles are green or brown, dark or bright: their colour surely differs only from its surroundings on both
+sides. Leaves hide: nothing is known within their masks.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class ThinView:
     """One view, made smaller.
 
     Attributes:
-        share: (h, w) float32 in [0, 1], how surely a pixel differs from what is around it; 0 in leaves.
+        share: (h, w) float32 in [0, 1], how surely a pixel differs from its surroundings; 0 in leaves.
         is_hidden: (h, w) bool, in or next to a leaf.
         px_from_world: (3, 4), to its pixels.
         scale: pixels of the photo per pixel.
@@ -38,14 +38,8 @@ class ThinView:
 
 
 def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world: Floats, points: Floats) -> ThinView:
-    """Find what is thin in one photo.
-
-    Args:
-        photo: (H, W, 3) RGB.
-        is_leaf: (H, W), the masks of all leaves.
-        px_from_world: (3, 4).
-        points: (P, 3) of the plant: what is around their image counts.
-    """
+    """Find thin parts in one photo (H, W, 3) RGB, around the image of `points` (P, 3) of the plant. `is_leaf` (H, W)
+    unites the masks of all leaves; `px_from_world` is (3, 4)."""
     cam = points @ px_from_world[:, :3].T + px_from_world[:, 3]
     px = cam[:, :2] / np.maximum(cam[:, 2:], 1e-9)
     size = np.array(is_leaf.shape[::-1])
@@ -87,12 +81,8 @@ class ThinCells:
 
 
 def find_cells(views: Sequence[ThinView], points: Floats, axes: Floats) -> ThinCells:
-    """Cells around a plant that most views which see them show as thin; small ones only where larger ones do.
-
-    Args:
-        points: (P, 3) of the plant.
-        axes: (3, 3) in rows, of the plant itself, along which cells lie.
-    """
+    """Cells around a plant of points (P, 3) that most views which see them show as thin; small ones only where larger
+    ones do. Cells lie along `axes` (3, 3), in rows, of the plant itself."""
     own = points @ axes.T
     low, high = own.min(0), own.max(0)
     beyond = THIN.beyond * float((high - low).max())

@@ -34,12 +34,10 @@ class TubeEvidence:
     """Evidence that a candidate is a stem; NaN where the views do not tell.
 
     Attributes:
-        tube: the tube that explains its masks.
         tube_iou: median IoU of the tube and the masks.
         patch_iou: the same of its surface, on the same pixels.
-        width_change: by how much the widths that different views show of the same place differ: standard deviation of
-            their logarithms, median along the tube, without what pixels, and masks that are too large or small as a
-            whole, explain. About 0 for stems.
+        width_change: by how much views differ in the width of the same place: standard deviation of logarithms, median
+            along the tube, minus the effect of pixels and of masks too large or small. About 0 for stems.
         width: median over places and views, world units.
         length: along the tube, world units.
         relative_aspect: length over width of its surface, over the median of the plant's surfaces. Leaves that are long
@@ -94,9 +92,6 @@ def tube_evidence(
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         surfaces: {instance id: surface}; rough ones will do.
         least_aspect: min. `TubeEvidence.relative_aspect`; stems have more than `TUBE.least_aspect`.
-
-    Returns:
-        {instance id: evidence}.
     """
     if not any(surface.exists for surface in surfaces.values()):
         return {}
@@ -123,13 +118,8 @@ def tube_evidence(
 def compare_tube(
     masks: MaskStack, surface: LeafSurface, *, usual_aspect: float, mask_sd_px: float = 0.0
 ) -> TubeEvidence:
-    """The evidence of the masks of one candidate with a surface.
-
-    Args:
-        surface: that exists.
-        usual_aspect: median length over width of the plant's surfaces.
-        mask_sd_px: standard deviation of the distance by which the masks of this segmenter are too large.
-    """
+    """The evidence of the masks of one candidate with a surface, which must exist. `usual_aspect` is the median length
+    over width of the plant's surfaces; `mask_sd_px` as in `fit_tube`."""
     coefficients = surface.coefficients.numpy()
     relative_aspect = surface.length / surface.width / usual_aspect
     tube = fit_tube(masks, midrib_of(coefficients), mask_sd_px=mask_sd_px)
@@ -142,8 +132,7 @@ def compare_tube(
 
 
 def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> Floats:
-    """(S,) IoU of a surface and the mask in each view, drawn as much too large or small as the mask is believed to be,
-    as `Tube.iou` is."""
+    """(S,) IoU of a surface and the mask in each view, drawn too large or small as the mask is believed to be."""
     offsets_of = dict(zip(surface.views.tolist(), surface.offsets_px.tolist(), strict=False))
     measured = np.array([offsets_of.get(view, np.nan) for view in masks.views.tolist()])
     offsets = believe_offsets(measured, mask_sd_px / masks.pixel_size)
@@ -151,10 +140,8 @@ def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> 
 
 
 def width_change(masks: MaskStack, tube: Tube, *, mask_sd_px: float) -> tuple[float, float]:
-    """How much the apparent width differs between views (see `TubeEvidence`), and its median.
-
-    NaN where no place is seen by `TUBE.least_views` views.
-    """
+    """How much the apparent width differs between views (see `TubeEvidence`), and its median. NaN where no place is
+    seen by `TUBE.least_views` views."""
     widths, pixels = apparent_widths(masks, tube.axis)
     is_seen = np.isfinite(widths)
     places = is_seen.sum(0) >= TUBE.least_views

@@ -1,4 +1,4 @@
-"""Where the fit of each leaf starts: patches through the hulls of its masks, moved to the masks, the best of them.
+"""Starts of the fit of each leaf: patches through the hulls of its masks, moved to the masks, the best of them.
 
 Leaves are searched side by side: the outlines of all of their patches are compared with the masks in one call.
 """
@@ -25,9 +25,9 @@ from mvseg.reconstruction.surface.patch_start import start_patches
 def find_starts(stacks: Sequence[MaskStack], *, is_rough: bool) -> list[tuple[MaskStack, list[Floats]]]:
     """The best of several starts of each leaf, moved to its masks; and the masks that are right.
 
-    Rough fits have one. They tell leaves from what is none, and among many starts masks of two leaves find one, too,
-    that seems to explain them: so others than the likeliest are only tried where that ends badly. The first hull asks
-    that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
+    Rough fits, which tell leaves from others, have one: among many starts, masks of two leaves find one, too, that
+    seems to explain them. So others than the likeliest are only tried where that ends badly. The first hull asks that
+    no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
     turned = [_carve(masks.turn_world(masks.axes)) for masks in stacks]
     few = [_few_views(masks, hull.points.mean(0)) if len(hull.points) else masks for masks, hull in turned]
@@ -61,7 +61,6 @@ def _carve(masks: MaskStack) -> tuple[MaskStack, Hull]:
 
 
 def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
-    """At most `SEARCH.searched_views` of the views, evenly spread around the middle of the leaf."""
     matrices, shifts = masks.px_from_world[:, :, :3], masks.px_from_world[:, :, 3:]
     ways = -np.linalg.solve(matrices, shifts)[..., 0] - middle
     chosen = spread_directions(ways / np.linalg.norm(ways, axis=1, keepdims=True), SEARCH.searched_views)
@@ -139,8 +138,7 @@ def wide_cost(coefficients: Floats) -> Floats:
 
 
 def _likely_starts(masks: MaskStack, hull: Hull, *, is_rough: bool) -> list[Floats]:
-    """Sort the starts by how well they explain the masks before any fit. For a rough fit the first one is enough where
-    it clearly shows how the blade lies."""
+    """Sort the starts by how well they explain the masks; for a rough fit, a clear first one is enough."""
     starts, ranks = start_in(hull), []
     for start in starts:
         ranks.append(float(_ranks([masks], start[None])[0]))
@@ -150,8 +148,7 @@ def _likely_starts(masks: MaskStack, hull: Hull, *, is_rough: bool) -> list[Floa
 
 
 def start_in(hull: Hull) -> list[Floats]:
-    """`start_patches` in whole numbers of voxels: many of these are equally far from each other, and in world units
-    rounding, and with it the world's scale, would choose between them."""
+    """`start_patches` in whole numbers of voxels: many are equally far, and in world units rounding would choose."""
     starts = start_patches(hull.voxels.astype(float))
     for start in starts:
         start *= hull.size
@@ -170,10 +167,8 @@ def _ranks(stacks: Sequence[MaskStack], patches: Floats, offsets: Sequence[Float
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
-    """(S,) bool: masks that hardly any voxel (P, 3) falls into although nothing hides it there: another leaf's.
-
-    None where fewer than three would be left.
-    """
+    """(S,) bool: masks that hardly any voxel (P, 3) falls into although nothing hides it there: another leaf's. None
+    where fewer than three others remain."""
     inside, free = locate_points(masks, points)
     shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
     is_wrong = shares < SEARCH.wrong_share * np.median(shares)

@@ -22,7 +22,7 @@ class PatchFit:
 
     Attributes:
         coefficients: (26, 3).
-        covariance: (78, 78); NaN where the masks do not tell the coefficients: hardly any edge was met.
+        covariance: (78, 78); NaN where hardly any edge was met, so that masks do not tell the coefficients.
         residual_px: (S,) root mean square distance per view, robustly weighted.
         offsets_px: (S,) by how much the mask of each view is too large; NaN where none of its edges was met.
         spread: how far the areas of other fits that are as good are from this one's, as a share of it.
@@ -36,15 +36,11 @@ class PatchFit:
 
 
 def approach_patches(masks: MaskStack, starts: Floats, *, steps: range) -> tuple[Floats, Floats]:
-    """Move rough patches (L, 26, 3) until their outlines are near those of the masks of L leaves (`join_stacks`).
+    """Move rough patches (L, 26, 3) until their outlines are near those of the masks of L leaves; each ends as it would
+    alone.
 
-    Each ends where it would alone.
-
-    Args:
-        steps: FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends.
-
-    Returns:
-        The patches, and by how much each mask is too large (S,), pixels.
+    `steps` are FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends. Returns the patches, and by
+    how much each mask is too large (S,), pixels.
     """
     moved, coefficients = _to_unit_worlds(masks, starts)
     grid = patch_grid(*(FIT.far_grid if steps == FIRST_HALF else FIT.grid))
@@ -109,8 +105,7 @@ def fit_patches(
 
 
 def _to_unit_worlds(masks: MaskStack, starts: Floats) -> tuple[MaskStack, Floats]:
-    """Masks and coefficients (L, 26, 3) in worlds moved and scaled to each patch: nothing depends on the scene's origin
-    and unit."""
+    """Masks and coefficients (L, 26, 3) in worlds moved and scaled to each patch."""
     centres, scales = starts[:, MIDRIB].mean(1), measure_patch(starts).length
     coefficients = starts.copy()
     coefficients[:, MIDRIB] -= centres[:, None]
@@ -126,14 +121,7 @@ def _from_unit_worlds(coefficients: Floats, starts: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Equations of the outlines for the coefficients of L patches.
-
-    Attributes:
-        distances: of N samples, with their places and derivatives.
-        px: (N,) the same without the offsets of masks, pixels.
-        weight: (N,)
-        noise: (L,) errors of the masks of each leaf, in those of clean masks, at least 1.
-    """
+    """Outlines of L patches: N distances, px (N,) without offsets of masks, weights (N,), noise (L,) >= 1."""
 
     distances: Distances
     px: Floats
@@ -141,16 +129,12 @@ class _Equations:
     noise: Floats
 
     def of_leaf(self, leaf: int) -> _Equations:
-        """State of one patch."""
         keep = self.distances.leaf == leaf
         return _Equations(self.distances.of_leaf(leaf), self.px[keep], self.weight[keep], self.noise[[leaf]])
 
 
 def _covariance(matrix: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
-    """(78, 78) of one patch: the fit's own, what the views contradict each other by, and what all masks may share.
-
-    NaN where the normal matrix (78, 78) is singular. The factors were found on simulated leaves, see docs/surfaces.md.
-    """
+    """(78, 78): the fit's own, contradictions of views, errors that masks may share; NaN where singular."""
     inverse = invert_normal(matrix)
     weight, px = equations.weight, equations.px
     num_views = int(stack.max(initial=0)) + 1
@@ -181,7 +165,7 @@ def invert_normal(matrix: Floats) -> Floats:
 
 
 def _weigh(distances: Distances, masks: MaskStack, offsets: Floats, *, scale_px: float) -> _Equations:
-    """Robust weights, after what the masks of each view (S,) are all too large or too small by is taken off."""
+    """Robust weights, after the offset of each view's masks (S,) is taken off."""
     px, leaf = distances.px - offsets[distances.stack], distances.leaf
     spread = np.nan_to_num(per_view(np.abs(px), leaf, distances.num_leaves))
     scale = np.maximum(scale_px, FIT.scale_factor * spread)

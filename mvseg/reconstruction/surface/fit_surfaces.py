@@ -55,13 +55,13 @@ def fit_surfaces(
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
-    An instance that more than `most_views` views show is fitted to that many of them, see `spread_views`.
-    Inputs may be on any device; the work is done on the CPU, and surfaces are there.
+    An instance that more than `most_views` views show is fitted to that many of them, see `spread_views`. Inputs may be
+    on any device; the work is done on the CPU, and surfaces are there.
 
     Args:
         regions: D regions. Those matched to nothing hide leaves as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
-        starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
+        starts: instance id -> a surface that is nearly right; no start is looked for.
         same_segmenter: surfaces whose `offsets_px` tell how the masks err; None: those that are fitted here. With those
             of a scene before edits, an edit of one leaf does not move all others a little.
         most_views: at least 2; None: `SEARCH.most_views`.
@@ -114,8 +114,6 @@ def fit_surfaces(
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A leaf to be fitted: the name of that fit, its masks, and a start if there is one."""
-
     name: str
     masks: MaskStack
     start: Floats | None
@@ -123,8 +121,7 @@ class _Asked:
 
 @dataclass(frozen=True, eq=False)
 class _AskedAgain:
-    """A leaf to be fitted for the second time, with the errors of its masks, and the grids (rows, columns, 3) of the
-    leaves that may hide it."""
+    """A leaf to be fitted again, with the errors of its masks, and the grids (rows, columns, 3) that may hide it."""
 
     name: str
     masks: MaskStack
@@ -151,7 +148,6 @@ def _fit_new(
 def _ask_again(
     asked: Mapping[int, _Asked], cache: SurfaceCache, same_segmenter: Mapping[int, LeafSurface] | None
 ) -> dict[int, _AskedAgain]:
-    """The second fits, of the leaves whose first one found something."""
     found = {instance: cache.approaches[each.name] for instance, each in asked.items()}
     approaches = {instance: each for instance, each in found.items() if each is not None}
     measured: Mapping[int, Approach | LeafSurface] = approaches if same_segmenter is None else same_segmenter
@@ -201,9 +197,7 @@ def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
 
 
 def _approach(asked: Sequence[_Asked], *, is_rough: bool) -> list[tuple[MaskStack, PatchFit | None]]:
-    """The right masks of each leaf, and a fit from its start, or the best of several fits from starts that are searched
-    for. Its spread is that of the areas of nearly equally good fits.
-    """
+    """The right masks of each leaf, and its best fit, whose spread is that of the areas of nearly equally good fits."""
     searched = iter(find_starts([each.masks for each in asked if each.start is None], is_rough=is_rough))
     given = [next(searched) if each.start is None else (each.masks, [each.start]) for each in asked]
     pairs = [(masks, start) for masks, starts in given for start in starts]

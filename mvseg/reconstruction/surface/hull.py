@@ -17,13 +17,12 @@ from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """Voxels (P, 3), whole numbers; voxel (a, b, c) has its centre at corner + size * (a + 0.5, b + 0.5, c + 0.5).
+    """Voxels (P, 3), whole numbers, that more than half of the masks show; voxel (a, b, c) has its centre at corner +
+    size * (a + 0.5, b + 0.5, c + 0.5).
 
     Attributes:
-        voxels: that more than half of the masks show.
-        is_seen: (P,) bool, of these, that no view looks past; where faulty masks make that too strict, none.
+        is_seen: (P,) bool, voxels that no view looks past; none where faulty masks make that too strict.
         corner: (3,) in the world.
-        size: of a voxel.
     """
 
     voxels: Ints
@@ -38,10 +37,7 @@ class Hull:
 
 
 def carve_hull(masks: MaskStack) -> Hull:
-    """The voxels that most masks of a leaf show, from an octree.
-
-    Masks of nearly parallel views may share an unbounded space: see `halve_cells`.
-    """
+    """The voxels that most masks of a leaf show, from an octree; for nearly parallel views see `halve_cells`."""
     silhouettes = Silhouettes(tuple(torch.from_numpy(masks.inside)), torch.from_numpy(masks.px_from_world))
     enough = HULL.cell_px * float((silhouettes.distances / silhouettes.focal).quantile(0.5))
     for cells in halve_cells(silhouettes, HULL.shown_share):

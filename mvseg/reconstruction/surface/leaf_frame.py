@@ -1,8 +1,7 @@
-"""A frame of the leaf itself: what is found in it does not depend on how its world or its photos are turned.
+"""A frame of the leaf itself, so that results do not depend on how its world or its photos are turned.
 
-Voxels and pixels have axes. Where masks contradict each other, a start that is found in other voxels may end in another
-fit. So voxels lie along directions of the leaf's own cameras, and its photos are turned by quarters, and mirrored, to
-one side of these.
+Voxels and pixels have axes. Where masks contradict each other, a start in other voxels may end in another fit. So
+voxels lie along directions of the leaf's own cameras, and its photos are turned by quarters, and mirrored, to match.
 """
 
 from __future__ import annotations
@@ -27,13 +26,9 @@ def find_middle(px_from_world: Floats, px: Floats) -> Floats:
 def find_axes(px_from_world: Floats, middle: Floats, areas: Ints) -> Floats:
     """Orthonormal axes (3, 3), in rows, that turn and are mirrored as the world is.
 
-    The first one points to the camera with the largest mask, the others to the camera that is farthest from the line,
-    and from the plane, of those before; where there is none, they are at right angles.
-
-    Args:
-        px_from_world: (S, 3, 4).
-        middle: (3,) of the leaf.
-        areas: (S,) of its masks, pixels; cameras are asked in their order, the largest first.
+    The first one points to the camera with the largest mask of `areas` (S,), pixels; the others to the camera that is
+    farthest from the line, and from the plane, of those before; where there is none, they are at right angles.
+    `px_from_world` is (S, 3, 4), `middle` (3,) that of the leaf.
     """
     centers = -np.linalg.solve(px_from_world[:, :, :3], px_from_world[:, :, 3:])[..., 0]
     ways = (centers - middle)[np.argsort(-areas, kind="stable")]
@@ -55,11 +50,9 @@ def _farthest(vectors: Floats) -> Floats | None:
 
 
 def find_quarters(px_from_world: Floats, middle: Floats, axes: Floats) -> Ints:
-    """(S, 2, 2) of -1, 0 and 1: a turn of each photo by quarters, or its mirror image.
-
-    Afterwards the longest of the axes, as the photo shows it, points to the right rather than up or down, and all
-    photos are mirror images of photos with right-handed axes, or none is.
-    """
+    """(S, 2, 2) of -1, 0 and 1: a turn of each photo by quarters, or its mirror image. Afterwards the longest of the
+    axes, as the photo shows it, points to the right rather than up or down, and all photos are mirror images of photos
+    with right-handed axes, or none is."""
     cam = px_from_world[:, :, :3] @ middle + px_from_world[:, :, 3]
     matrix = px_from_world[:, :, :3] @ axes.T
     # (S, 2, 3) the axes, as photos show them.

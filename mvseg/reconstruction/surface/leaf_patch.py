@@ -1,10 +1,10 @@
-"""A leaf as a spline patch: the surface, linear in its coefficients, and what is expected of leaves.
+"""A leaf as a spline patch: the surface, linear in its coefficients, and the prior of leaves.
 
     x(u, v) = m(u) + f(u) [v Q(u) + |v| R(u) + v^2 S(u)],    f(u) = sqrt(4 u (1 - u))
 
 u in [0, 1] runs along the leaf, v in [-1, 1] across it. m is the midrib, Q points to the side, R folds the two halves
-about the midrib (and tells them apart), S curls them. m, Q, R and S are clamped B-splines with vector coefficients,
-26 in all; f closes the outline at both ends. Coefficients are (26, 3) float64 arrays in the order m, Q, R, S.
+about the midrib (and tells them apart), S curls them. m, Q, R and S are clamped B-splines with vector coefficients, 26
+in all; f closes the outline at both ends. Coefficients are (26, 3) float64 arrays in the order m, Q, R, S.
 """
 
 from __future__ import annotations
@@ -69,10 +69,8 @@ class PatchGrid:
     @cached_property
     def outline_basis(self) -> Floats:
         """(3 * rows * columns, 26) where samples of an outline may lie: the points of the grid, row by row; the middles
-        between each of them and the next one of its column; and those between it and the next one of its row.
-
-        After the last one of a column or row there is none: these rows mean nothing.
-        """
+        between each of them and the next one of its column; and those between it and the next one of its row. After the
+        last one of a column or row there is none: these rows mean nothing."""
         grid = self.basis.reshape(*self.shape, -1)
         middles = [(grid + np.roll(grid, -1, axis)) / 2 for axis in (0, 1)]
         return np.concatenate([grid, *middles]).reshape(-1, NUM_COEFFICIENTS)
@@ -91,10 +89,8 @@ def patch_grid(num_rows: int, num_columns: int) -> PatchGrid:
 
 
 def grid_triangles(num_rows: int, num_columns: int) -> Ints:
-    """(F, 3) triangles of a patch grid whose first and last row are one vertex each.
-
-    Vertex 0 is the base, vertex 1 + (row - 1) * num_columns + column an inner point, the last vertex the tip.
-    """
+    """(F, 3) triangles of a patch grid whose first and last row are one vertex each. Vertex 0 is the base, vertex 1 +
+    (row - 1) * num_columns + column an inner point, the last vertex the tip."""
     inner = 1 + np.arange((num_rows - 2) * num_columns).reshape(num_rows - 2, num_columns)
     a, b, c, d = (x.ravel() for x in (inner[:-1, :-1], inner[:-1, 1:], inner[1:, 1:], inner[1:, :-1]))
     base, tip = np.zeros(num_columns - 1, int), np.full(num_columns - 1, inner[-1, -1] + 1)
@@ -113,8 +109,8 @@ def grid_vertices(points: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class PatchSize:
-    """Units of the prior and of the steps of the fit: length of the midrib and largest half-width, of one
-    patch or of several (...)."""
+    """Units of the prior and of the fit's steps: midrib length and largest half-width, of one patch or several
+    (...)."""
 
     length: Floats
     half_width: Floats
@@ -129,13 +125,11 @@ def measure_patch(coefficients: Floats) -> PatchSize:
 
 
 def patch_prior(coefficients: Floats, size: PatchSize, *, noise: Floats | float) -> tuple[Floats, Floats]:
-    """Prior of leaves, as linear equations about the present coefficients.
+    """Prior of leaves, as linear equations about the present coefficients (..., 26, 3).
 
-    Directions (along the midrib, normal) are those of the present patch, so the answer does not depend on how the
-    world is turned.
+    Directions (along the midrib, normal) are those of the present patch, so that turns of the world do not matter.
 
     Args:
-        coefficients: (..., 26, 3).
         size: (...) length and half-width that the standard deviations are relative to.
         noise: (...) >= 1; fold, curl and shear, which faulty masks say little about, are held nearer to none by it.
 
@@ -170,8 +164,7 @@ def _along(rows: Floats, directions: Floats) -> Floats:
 
 @cache
 def _directed_rows() -> Floats:
-    """(E, 26) what the prior holds along directions: Q along the midrib, R and S along it, across and along the normal,
-    turns of the midrib, and its speed."""
+    """(E, 26) rows held along directions: Q, R and S, turns of the midrib, and its speed."""
     side, fold, curl = (np.eye(NUM_COEFFICIENTS)[part] for part in (SIDE, FOLD, CURL))
     return np.concatenate([side, *[fold] * 3, *[curl] * 3, np.diff(_speed_rows(), axis=0), _speed_rows()])
 
@@ -194,8 +187,7 @@ def _speed_rows() -> Floats:
 
 
 def _frame_counts() -> tuple[int, ...]:
-    """Numbers of directions that the prior needs, evenly spaced along the leaf: for Q, R, S, and for the ends of
-    pieces."""
+    """Numbers of evenly spaced directions that the prior needs: for Q, R, S, and for the ends of pieces."""
     return *COUNTS[1:], PRIOR.num_pieces + 1
 
 

@@ -33,11 +33,7 @@ MESH_SHAPE = (64, 17)  # definition: a mesh has so many rows and columns of vert
 
 @dataclass(frozen=True)
 class Quality:
-    """Is the surface to be trusted?
-
-    Attributes:
-        reasons: {code: sentence} of the reasons to doubt it, the gravest first; empty for a good one.
-    """
+    """Is the surface to be trusted? `reasons` {code: sentence} to doubt it, the gravest first; empty for a good one."""
 
     reasons: Mapping[str, str] = field(default_factory=dict)
 
@@ -88,7 +84,7 @@ class LeafSurface:
         return f"LeafSurface({sizes}{why})"
 
     def __getstate__(self) -> dict[str, Any]:
-        """What is pickled: not what it looks like, which follows from the rest."""
+        """State to pickle, without its drawn masks, which follow from the rest."""
         return self.__dict__ | {"_drawn": {}}
 
     @staticmethod
@@ -112,10 +108,8 @@ class LeafSurface:
 
     @property
     def is_credible(self) -> bool:
-        """May measures of the surface be given at all? False: the instance is better shown as voxels.
-
-        A patch that explains its masks badly is none of a leaf: buds, fruit and stems have no blade.
-        """
+        """May measures of the surface be given at all? False: the instance is better shown as voxels. A patch that
+        explains its masks badly is none of a leaf: buds, fruit and stems have no blade."""
         return self.exists and float(self.iou.median()) >= DOUBTS.credible_iou
 
     def points(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> Tensor:
@@ -180,9 +174,7 @@ class LeafSurface:
 
     def mesh(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> trimesh.Trimesh:
         """Open mesh of `points`, whose first vertex is the base and whose last one is the tip; empty without a surface.
-
-        Its normals point to the side that most cameras of the fit saw.
-        """
+        Its normals point to the side that most cameras of the fit saw."""
         if not self.exists:
             return trimesh.Trimesh()
         vertices = grid_vertices(self.points(num_rows, num_columns).numpy())
@@ -190,20 +182,14 @@ class LeafSurface:
 
     def project(self, cameras: Cameras) -> list[Tensor]:
         """V masks (H, W) bool on the cameras' device: the pixels that the surface covers half or more of, as if nothing
-        hid it.
-
-        Parts behind a camera are left out.
-        """
+        hid it. Parts behind a camera are left out."""
         return [
             part.paste((width, height)).to(cameras.device)
             for (width, height), part in zip(cameras.sizes.tolist(), self.project_parts(cameras), strict=True)
         ]
 
     def project_parts(self, cameras: Cameras) -> list[Crop]:
-        """Project as V crops on the CPU; empty ones where the surface is not in the view.
-
-        Drawn once for the same camera: many stages ask, and so does each edit of the user.
-        """
+        """Project as V crops on the CPU; empty ones where the surface is not in the view. Cached by camera."""
         cameras = cameras.to("cpu")
         poses, sizes = cameras.px_from_world.numpy(), cameras.sizes.numpy()
         keys = [pose.tobytes() + size.tobytes() for pose, size in zip(poses, sizes, strict=True)]

@@ -1,9 +1,8 @@
 """How the masks of one segmenter err: each is a little too large or too small as a whole.
 
-Of one leaf alone only the differences between its masks can be seen; what they share stays unknown, and the best guess
-is that they are right on average. But the masks of all leaves come from the same segmenter. The differences of all of
-them together show how its errors are spread, and with that each leaf's share is found better: errors that end sharply
-at 3 px tell by their extremes, errors with long tails by their middle.
+The masks of one leaf only show their differences; the best guess is that they are right on average. The differences of
+all leaves of a segmenter together show how its errors are spread, and with that each leaf's share is found better:
+errors that end sharply at 3 px tell by their extremes, errors with long tails by their middle.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from mvseg.reconstruction.surface.leaf_patch import Floats
 
 @dataclass(frozen=True, eq=False)
 class MaskErrors:
-    """How far the masks of a segmenter lie off the true outlines: a symmetric density.
+    """Symmetric density of how far the masks of a segmenter lie off the true outlines.
 
     Attributes:
         sd_px: their standard deviation.
@@ -36,10 +35,8 @@ class MaskErrors:
         return self.sd_px**2 / (self.sd_px**2 + ERRORS.measured_px**2)
 
     def centre(self, offsets: Floats) -> tuple[float, float]:
-        """Place of offset 0 among the offsets (S,) of one leaf, in pixels, and its standard deviation.
-
-        Mean and deviation of the posterior over all places between the smallest and the largest offset.
-        """
+        """Place of offset 0 among the offsets (S,) of one leaf, in pixels, and its standard deviation: of the posterior
+        over all places between the smallest and the largest offset."""
         places = np.arange(offsets.min(), offsets.max() + ERRORS.step_px, ERRORS.step_px)
         middle = len(self.density) // 2
         cells = np.round((offsets - places[:, None]) / ERRORS.step_px).astype(int) + middle
@@ -52,14 +49,8 @@ class MaskErrors:
 
 
 def learn_mask_errors(offsets: Sequence[Floats]) -> MaskErrors | None:
-    """The spread of the offsets of all masks of a scene.
-
-    Args:
-        offsets: of each leaf (S,) pixels by which its masks are too large, up to a number that they share.
-
-    Returns:
-        None where there are too few masks, or where they differ so little that they are clean.
-    """
+    """The spread of the offsets of all masks of a scene: of each leaf, (S,) pixels by which its masks are too large, up
+    to a number that they share. None where there are too few masks, or they differ so little that they are clean."""
     if sum(map(len, offsets)) < ERRORS.least_masks:
         return None
     centres = [winsorised_mean(each) for each in offsets]

@@ -1,4 +1,4 @@
-"""The masks of one leaf, ready for its fit: blurred, with samples of their edges, and with what may hide the leaf.
+"""The masks of one leaf, ready for its fit: blurred, with samples of their edges, and whatever may hide the leaf.
 
 Large masks are made smaller first: outlines need no more than `STACK.large_px` pixels across a leaf, and photos of any
 size cost the same. Positions are in pixels of these crops, each from its own top-left corner.
@@ -126,8 +126,7 @@ class MaskStack:
         return replace(self, px_from_world=matrices, axes=self.axes @ axes.T)
 
     def move_worlds(self, centres: Floats, scales: Floats) -> MaskStack:
-        """The same masks for world coordinates (x - centre) / scale of each leaf (L, 3), (L,); depths are divided by
-        `scale`, too."""
+        """The same masks for world coordinates (x - centre) / scale (L, 3), (L,) of each leaf; depths scale, too."""
         shift = (self.px_from_world[:, :, :3] @ centres[self.leaf, :, None])[..., 0] + self.px_from_world[:, :, 3]
         shift = shift / scales[self.leaf, None]
         return replace(self, px_from_world=np.concatenate([self.px_from_world[:, :, :3], shift[:, :, None]], 2))

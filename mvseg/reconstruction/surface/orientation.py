@@ -1,7 +1,7 @@
-"""Which end of a leaf is its base, and which of its sides is up.
+"""The base of a leaf among its ends, and the upper one of its sides.
 
-Bases sit on the stem: over the leaves of a plant, the ends that lie along one line. Of the two or three leaves of a
-seedling, the ends that are nearest to each other. The upper side is the one that the cameras look at.
+Bases sit on the stem: the ends of a plant's leaves that lie along one line; of the two or three leaves of a seedling,
+those that are nearest to each other. The upper side is the one that the cameras look at.
 """
 
 from __future__ import annotations
@@ -52,11 +52,7 @@ def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[
 
 
 def stem_distances(ends: Floats) -> Floats:
-    """(N, 2) distances of both ends of N leaves from the stem: the line near which each leaf has one end.
-
-    Args:
-        ends: (N, 2, 3), N >= 4.
-    """
+    """(N, 2) distances of both `ends` (N, 2, 3) of N >= 4 leaves from the stem: the line near one end of each leaf."""
     point = np.median(ends.reshape(-1, 3), axis=0)
     distances = np.linalg.norm(ends - point, axis=2)
     for _ in range(STEM.rounds):
@@ -71,12 +67,8 @@ def stem_distances(ends: Floats) -> Floats:
 
 
 def base_distances(ends: Floats) -> Floats:
-    """(N, 2) sums of the distances of both ends of N leaves from the bases of the others: the ends, one of each leaf,
-    that are nearest to each other. All choices are compared, so it is for few leaves; 0 for a single one.
-
-    Args:
-        ends: (N, 2, 3).
-    """
+    """(N, 2) sums of the distances of both `ends` (N, 2, 3) of N leaves from the bases of the others: the ends, one of
+    each leaf, that are nearest to each other. All choices are compared, so it is for few leaves; 0 for a single one."""
     own = np.arange(len(ends))
     apart = np.linalg.norm(ends[:, :, None, None] - ends, axis=-1)  # (N, 2, N, 2) between all ends
     choices = [np.array(each, int) for each in product((0, 1), repeat=len(ends))]

@@ -2,8 +2,8 @@
 
 Both ways: from samples of the patch's outline along their image normal to the mask's edge, and from samples of the
 mask's edge to the nearest outline sample with a similar normal. Distances are signed: positive where the patch has to
-grow. Where the mask ends because ANOTHER instance or the frame of the image hides the rest, its edge is not the leaf's
-rim: there the patch only has to cover the mask, and a negative distance does not count.
+grow. Where another instance or the frame hides the rest of the leaf, the mask's edge is not its rim: there the patch
+only has to cover the mask, and a negative distance does not count.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ class OutlineSamples:
     depth: Floats
 
     def select(self, keep: NDArray) -> OutlineSamples:
-        """Select samples at places (N,), or where `keep` (K,) is true."""
         places = np.flatnonzero(keep) if keep.dtype == bool else keep
         return OutlineSamples(*(getattr(self, field.name).take(places, 0) for field in fields(self)))
 
@@ -54,10 +53,8 @@ class OutlineSamples:
 def outline_samples(
     masks: MaskStack, grid: PatchGrid, projection: Projection
 ) -> tuple[OutlineSamples, NDArray[np.uint8]]:
-    """The visible outline of a patch in every view: its rim, and the folds that stand out against the background.
-
-    Also (S, H, W) uint8, above 0 where the patch covers a pixel of `masks`.
-    """
+    """The visible outline of a patch in every view: its rim, and the folds that stand out against the background. Also
+    (S, H, W) uint8, above 0 where the patch covers a pixel of `masks`."""
     samples = _concatenate(_rim_samples(grid, projection), _fold_samples(grid, projection))
     outside = samples.px + OUTLINE.outside_px * samples.normals
     covered = cover_crops(masks, projection)
@@ -104,7 +101,6 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     px, depth, is_front = projection.px.reshape(-1, 2), projection.depth.ravel(), grid_orientations(projection.px) > 0
 
     def middles(corner: NDArray) -> Floats:
-        """Middles of quads with this first corner."""
         quad: Floats = px[corner + columns + 1] + px[corner] + px[corner + columns] + px[corner + 1]
         return quad / 4
 
@@ -141,17 +137,15 @@ def _outwards(tangent: Floats, away: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Distances:
-    """N signed distances and what they depend on.
+    """N signed distances and their dependencies.
 
     Attributes:
         stack: (N,) place in `MaskStack.views`.
         px: (N,) how far the patch has to move outwards, pixels.
-        place: (N,) row of `PatchGrid.outline_basis` of the patch point.
+        place: (N,) row of `PatchGrid.outline_basis`, of `grid`, of the patch point.
         gradient: (N, 3) change of the pixel position along the normal per world unit.
         weight: (N,).
-        grid: that the places are of.
         leaf: (N,) place of the patch among L patches.
-        num_leaves: L.
     """
 
     stack: NDArray[np.int64]
@@ -176,10 +170,8 @@ class Distances:
         return (basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), 3 * basis.shape[1])
 
     def normal_equations(self, px: Floats, weight: Floats) -> tuple[Floats, Floats]:
-        """J' W J (L, 78, 78) and J' W px (L, 78) of the jacobian J of each patch, for distances and weights (N,).
-
-        The same place is seen in many views: what these ask of it is added up before it is spread over coefficients.
-        """
+        """J' W J (L, 78, 78) and J' W px (L, 78) of the jacobian J of each patch, for distances and weights (N,). The
+        same place is seen in many views, so it is summed over them before it is spread over coefficients."""
         num_places = len(self.grid.outline_basis)
         place = self.leaf * num_places + self.place
         is_asked = np.bincount(place, minlength=self.num_leaves * num_places) > 0
@@ -257,10 +249,8 @@ def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) 
 def search_edges(
     masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, reach: float, offsets: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach.
-
-    Also, is the leaf hidden beyond that edge?
-    """
+    """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach. Also,
+    is the leaf hidden beyond that edge?"""
     steps = np.linspace(-reach, reach, 2 * int(np.ceil(reach)) + 1)
     middle = len(steps) // 2
     near = steps[max(middle - OUTLINE.near_steps, 0) : middle + OUTLINE.near_steps + 1]
@@ -273,8 +263,7 @@ def search_edges(
 
 
 def _nearest_edges(masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, steps: Floats) -> Floats:
-    """Signed distance (K,) to the nearest edge from inside to outside between the first and the last of the places
-    `steps` along the normals, evenly spaced; infinite where there is none."""
+    """Signed distance (K,) to the nearest edge out of the mask among evenly spaced `steps`; infinite for none."""
     px = np.empty((2, len(samples.px), len(steps)))  # all x, then all y: broadcasting over two numbers is slow
     for axis, along in enumerate(px):
         np.multiply(samples.normals[:, axis, None], steps, out=along)
@@ -293,10 +282,7 @@ def _nearest_edges(masks: MaskStack, samples: OutlineSamples, blurred: NDArray[n
 def _is_hidden(
     masks: MaskStack, stack: NDArray, edge: Floats, *, normals: Floats, offsets: Floats
 ) -> NDArray[np.bool_]:
-    """Does another instance, or the end of the image, begin just beyond these places of an edge?
-
-    Masks that are too small end before they reach what hides the leaf.
-    """
+    """Does another instance, or the end of the image, begin just beyond these places of an edge?"""
     hidden = np.zeros(len(edge), bool)
     gap = np.maximum(0, -offsets)[stack]
     for step in OUTLINE.beyond_px:

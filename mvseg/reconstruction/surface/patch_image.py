@@ -1,4 +1,4 @@
-"""What cameras see of a patch: its projection, the pixels that it covers, and which neighbours lie behind it."""
+"""Images of a patch: its projection, the pixels that it covers, and which neighbours lie behind it."""
 
 from __future__ import annotations
 
@@ -48,18 +48,14 @@ def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
 
 def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None) -> Floats:
     """(S,) IoU of grid points (rows, columns, 3) of a patch and the mask in each view, where nothing else hides it.
-
-    With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is.
-    """
+    With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is."""
     shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, is_blurred=False)
     return crop_ious(masks, shares >= 0.5)
 
 
 def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats | None = None) -> Floats:
-    """(S,) IoU of covered pixels (S, H, W) and the mask in each view, where nothing else hides them.
-
-    With `offsets` (S,), pixels, the masks are made as much smaller.
-    """
+    """(S,) IoU of covered pixels (S, H, W) and the mask in each view, where nothing else hides them; masks are made
+    smaller by `offsets` (S,), pixels."""
     inside = masks.inside if offsets is None else masks.depth_px > offsets[:, None, None]
     covered = covered & (masks.others == 0)
     common, either = (np.array(list(map(np.count_nonzero, each))) for each in (covered & inside, covered | inside))
@@ -70,10 +66,8 @@ def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats |
 def draw_patch(
     masks: MaskStack, projection: Projection, *, offsets: Floats | None = None, is_blurred: bool = True
 ) -> NDArray[np.float32]:
-    """(S, H, W) the projected grid as a blurred mask, like `MaskStack.blurred`, or sharp.
-
-    With `offsets` (S,), pixels, it is grown or shrunk as the mask of each view seems to be.
-    """
+    """(S, H, W) the projected grid as a blurred mask, like `MaskStack.blurred`, or sharp. With `offsets` (S,), pixels,
+    it is grown or shrunk as the mask of each view seems to be."""
     drawn = np.zeros((len(masks), *masks.size), np.float32)
     beside = IMAGE.drawn_beside + (0 if offsets is None else np.ceil(np.abs(offsets))[:, None])
     low = np.clip(np.floor(projection.px.min((1, 2))) - beside, 0, masks.sides).astype(int)
@@ -103,7 +97,7 @@ def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
 def fill_grids(canvases: Iterable[NDArray[np.uint8]], px: Floats) -> None:
     """Set the pixels of S canvases (H, W) that projected grids (S, rows, columns, 2) cover to 255.
 
-    Its rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
+    The rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
     the other side: the quads of the side that shows fewer of them do the rest.
     """
     corners, quads = _fixed(px), _quad_places(*px.shape[1:3])
@@ -145,11 +139,8 @@ def _quad_places(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.float32]:
-    """(height, width) share of each pixel that quads (T, 4, 2) cover.
-
-    Drawn several times as large. OpenCV's polygons include their border: they are `IMAGE.drawn_too_far` small pixels
-    too wide on every side.
-    """
+    """(height, width) share of each pixel that quads (T, 4, 2) cover. Drawn several times as large. OpenCV's polygons
+    include their border: they are `IMAGE.drawn_too_far` small pixels too wide on every side."""
     canvas = np.zeros((size[1] * IMAGE.supersampled, size[0] * IMAGE.supersampled), np.uint8)
     first, second = polygons[:, 2] - polygons[:, 0], polygons[:, 3] - polygons[:, 1]
     is_front = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > 0
@@ -191,12 +182,12 @@ def hiding_pixels(
 ) -> NDArray[np.int32]:
     """(S, H, W) int32: which instance hides the leaf there, 0 for none, as the surfaces have it.
 
-    A pixel that shows another instance hides nothing where that one's surface lies behind the leaf. And a surface in
-    front of the leaf hides it, whether that instance has a mask there or not. The order of the others does not matter,
-    but for which of several ids a pixel has.
+    A pixel that shows another instance hides nothing where its surface lies behind the leaf. A surface in front of the
+    leaf hides it, whether that instance has a mask there or not. The order of the others only decides which of several
+    ids a pixel has.
 
     Args:
-        points: (rows, columns, 3) grid points of its present patch.
+        points: (rows, columns, 3) grid points of the leaf's present patch.
         others: instance id -> grid points of its patch. Instances without a patch may hide anything.
         margin: world units by which another one must be farther away to lie behind, or nearer to lie in front.
     """
@@ -230,8 +221,7 @@ def hiding_pixels(
 
 
 def _gaps(places: NDArray[np.int64], surface: tuple[cKDTree, Floats], own: tuple[cKDTree, Floats]) -> Floats:
-    """(P,) how much farther away a surface is than another one, at pixels (P, 2) in rows and columns; each is given by
-    its points in the image and their depths."""
+    """(P,) how much farther a surface is than the own one at pixels (P, 2); each as image points and depths."""
     centres = places[:, ::-1] + 0.5
     far, near = (depth[tree.query(centres)[1]] for tree, depth in (surface, own))
     gaps: Floats = far - near

@@ -1,4 +1,4 @@
-"""Where the fit of a leaf patch starts: a patch through the occupied voxels of the instance's hull."""
+"""Starts of the fit of a leaf patch: patches through the occupied voxels of the instance's hull."""
 
 from __future__ import annotations
 
@@ -24,18 +24,14 @@ from mvseg.reconstruction.surface.leaf_patch import (
 
 
 def start_patches(points: Floats) -> list[Floats]:
-    """Rough patches through a cloud of points, the likely one first.
+    """Rough patches (26, 3), fold and curl 0, through centres of occupied voxels (P, 3) float64, the likely one first.
 
-    The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their
-    two ends. Windowed centroids along it are the midrib, spreads across it the sides. Cameras that all look down at
-    one angle, or from one side, leave hulls of level leaves as thick as these are wide: there the spreads are no guide.
+    The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their two
+    ends. Windowed centroids along it are the midrib, spreads across it the sides. Cameras that all look down at one
+    angle, or from one side, leave hulls of level leaves as thick as these are wide: there the spreads are no guide.
 
-    Args:
-        points: (P, 3) float64, centres of occupied voxels.
-
-    Returns:
-        (26, 3) coefficients each, fold and curl 0. The likely one runs along the longest axis; the others have sides in
-        other directions, or run across it. None where all points are on one line, and none without a length.
+    The likely one runs along the longest axis; the others have sides in other directions, or run across it. None where
+    all points are on one line, and none without a length.
     """
     points = _thin(points)
     if len(points) < 2:
@@ -53,11 +49,7 @@ def start_patches(points: Floats) -> list[Floats]:
 
 
 def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
-    """Patches whose u follows `place` (P,).
-
-    `side` (3,) is roughly where v of the first points to: along the largest spread across; the others are turned about
-    the midrib.
-    """
+    """Patches whose u follows `place` (P,); v of the first points along `side` (3,), of others about the midrib."""
     low, high = np.quantile(place, [STARTS.trimmed, 1 - STARTS.trimmed])
     t = np.clip((place - low) / max(high - low, 1e-12), 0, 1)
     middles, sides = _windows(points, t, side)
@@ -70,10 +62,7 @@ def _thin(points: Floats) -> Floats:
 
 
 def _geodesic_places(points: Floats) -> Floats:
-    """(P,) distance along the cloud from one of its far ends, over the nearest-neighbour graph.
-
-    Loose pieces are joined by the straight distance to the nearest point of the largest piece.
-    """
+    """(P,) distance from a far end of the cloud, over the nearest-neighbour graph; loose pieces are joined."""
     tree = cKDTree(points)
     reach = tree.query(points, k=min(STARTS.neighbours + 1, len(points)))[0][:, -1]
     near = tree.query_ball_point(points, reach * (1 + STARTS.tie))  # of voxels that are equally near, all

@@ -1,4 +1,4 @@
-"""Fits of surfaces by all that they follow from: own masks, what may hide the leaf, cameras, start and numbers.
+"""Fits of surfaces by all their inputs: own masks, masks that may hide the leaf, cameras, start and numbers.
 
 The fits are pure functions of these, so a cache changes no bit of a result, whatever was fitted before.
 """
@@ -42,9 +42,9 @@ class SurfaceCache:
     """Surfaces that were fitted; `fit_surfaces` looks here first, and adds to it.
 
     Attributes:
-        approaches: {name of a first fit: what it found}; None where masks agree on no point.
+        approaches: {name of a first fit: its outcome}; None where masks agree on no point.
         surfaces: {name of a rough or second fit: the surface}, not oriented.
-        oriented: {name, and how it lies: the surface}, which remembers what it looks like.
+        oriented: {name, and how it lies: the surface}, which remembers its image.
     """
 
     approaches: dict[str, Approach | None] = field(default_factory=dict)
@@ -73,11 +73,7 @@ def name_second(
     *,
     errors: MaskErrors | None,
 ) -> str:
-    """Digest of all that a second fit follows from.
-
-    Args:
-        others: {instance id: points of its grid} that may hide the leaf; their ids do not matter.
-    """
+    """Digest of all inputs of a second fit; ids of `others` {instance id: points of its grid} do not matter."""
     hiding = sorted(_digest(points, masks.others == other) for other, points in others.items())
     of_all = [] if errors is None else [errors.density, np.array(errors.sd_px)]
     found = approach.views, approach.coefficients, approach.offsets_px

@@ -1,4 +1,4 @@
-"""What the page needs to correct a result: where its pictures are in the user's photos, its name, and the questions."""
+"""Data for correcting a result on the page: where its pictures are in the photos, its name, and the questions."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ COLUMNS = 33  # limit: columns of the grid of a lens: between its points, straig
 
 
 def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
-    """The data of the mode "Correct": the edits of the result, and the problem of each, if any;
-    `run` is what run.json says."""
+    """The data of the mode "Correct": the edits of the result, and the problem of each; `run` is its run.json."""
     marks = mark_photos(result.photos or Photos(result.scene))
     made = () if result.corrections is None else result.corrections.edits
     edits = dump_edits(made)

@@ -56,8 +56,7 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
 
 
 def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Definition]) -> dict[str, Any]:
-    """{trait: its value, standard deviation (None without one), and what it was measured on}; those that are missing
-    have only a reason why."""
+    """{trait: its value, standard deviation (None without one), and shape}; missing ones only have a reason."""
     described: dict[str, Any] = {}
     for trait in traits:
         number = numbers[trait.name]
@@ -70,9 +69,8 @@ def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Defini
 
 
 def describe_traits(traits: Traits | None) -> dict[str, Any]:
-    """The traits of leaves that at least one leaf has, in the order of the table: what they mean, in which unit, and
-    whether the table has a column for them; those of the plant; and its numbers.
-    """
+    """The traits of leaves that at least one leaf has, in the order of the table: meaning, unit, and whether the table
+    has a column for them; those of the plant; and its numbers."""
     if traits is None:
         return {"traits": [], "plantTraits": [], "whole": {}}
     order = (*SURFACE_TRAITS, *NODE_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS, *SEEN_TRAITS)

@@ -34,22 +34,13 @@ RUN_FIELDS = (
 
 
 def write_report(path: Path, result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> None:
-    """Write the page, see `build_page`.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write the page, see `build_page`. Raises OSError: the file cannot be written."""
     path.write_text(build_page(result, pictures, run=run), encoding="utf-8", newline="\n")
 
 
 def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any], is_served: bool = False) -> str:
-    """The page.
-
-    Args:
-        result: what is shown; without shapes the leaves are missing in 3D.
-        is_served: `mvseg correct` serves it: it sends each edit there, and shows the consequences. Otherwise it
-            connects to nothing.
-    """
+    """The page of a result; without shapes the leaves are missing in 3D. `is_served`: `mvseg correct` serves it: it
+    sends each edit there, and shows the consequences. Otherwise it connects to nothing."""
     data = describe_page(result, pictures, run=run)
     data["correct"]["isServed"] = is_served
     return Template(_read("page.html")).substitute(

@@ -1,4 +1,4 @@
-"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks."""
+"""Pictures of a photo on the page: its part with the plant, a thumbnail of the whole, and the outlines of the masks."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ class MaskContour:
         box: xyxy, around all of it.
         at: where its number goes: the middle of the thickest place.
         height: height of its number.
-        match_score: see `Matching`.
-        is_sure: whether that is at least 0.5.
+        is_sure: whether its `match_score` (see `Matching`) is at least 0.5.
     """
 
     region: int
@@ -58,7 +57,6 @@ class Picture:
         thumbnail: JPEG of the whole photo.
         box: xyxy of that part, in shares of the photo's width and height.
         proportion: its height / width.
-        outlines: outlines of the masks.
     """
 
     jpeg: bytes
@@ -83,9 +81,8 @@ class Picture:
 
 
 def draw_picture(photo: np.ndarray, masks: Masks, *, view: int, is_whole: bool = False) -> Picture:
-    """The picture of one view, from its photo (H, W, 3) uint8 RGB, undistorted; the more views there are, the smaller,
-    so that a page of 60 views can still be sent. `is_whole`: of all of it, since leaves are looked for that no mask
-    shows."""
+    """The picture of one view, from its photo (H, W, 3) uint8 RGB, undistorted; the more views, the smaller, so that a
+    page of 60 views can still be sent. `is_whole`: of all of it, since leaves are looked for that no mask shows."""
     height, width = photo.shape[:2]
     box = x1, y1, x2, y2 = (0, 0, width, height) if is_whole else find_plant(masks, view=view, size=(width, height))
     proportion = (y2 - y1) / (x2 - x1)
@@ -111,8 +108,8 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
 
 
 def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
-    """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
-    that the picture shows (`box`, xyxy, pixels), too: the user may look for them."""
+    """The masks of one view, large ones first, so that small ones lie on top; those outside of the shown part of the
+    photo (`box`, xyxy, pixels), too: the user may look for them."""
     regions = masks.regions
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]
@@ -141,10 +138,8 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
 
 
 def trace_mask(mask: NDArray[np.uint8], corner: NDArray[np.int64], *, box: Box) -> tuple[str, Box]:
-    """The outline of a mask (h, w) of at least one pixel as a path of SVG, and the box around it.
-
-    `corner` (2,) is the column and row of its top-left pixel in the photo, `box` the part that is `UNITS` wide.
-    """
+    """The outline of a mask (h, w) of at least one pixel as a path of SVG, and the box around it. `corner` (2,) is the
+    column and row of its top-left pixel in the photo, `box` the part that is `UNITS` wide."""
     lines, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     parts, corners = [], []
     for line in lines:

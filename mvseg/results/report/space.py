@@ -1,8 +1,5 @@
-"""What the page shows in 3D: the leaves as small meshes, and the cameras.
-
-Everything is in the page's own frame: +y is up, the middle of the plant is at the origin, and all leaves are within a
-radius of 1.
-"""
+"""The 3D view of the page: the leaves as small meshes, and the cameras. In the page's frame +y is up, the middle of the
+plant is at the origin, and all leaves are within a radius of 1."""
 
 from __future__ import annotations
 
@@ -62,11 +59,9 @@ class Frame:
 
 
 def describe_space(result: Result) -> dict[str, Any]:
-    """Meshes, cameras and a grid on the ground, as the page reads them.
-
-    Cameras are given by their centre, the corners of the photo (top left, top right, bottom right, bottom left) at
-    depth 1 from it, where their photo is up, and where they look.
-    """
+    """Meshes, cameras and a grid on the ground, as the page reads them. Cameras are given by their centre, the corners
+    of the photo (top left, top right, bottom right, bottom left) at depth 1, and where their photo is up and where they
+    look."""
     meshes = small_meshes(result)
     frame = find_frame(result.scene, meshes)
     placed = {leaf: frame.place(mesh.vertices) for leaf, mesh in meshes.items()}
