@@ -27,8 +27,7 @@ SHOWN = 4  # limit: names of running scenes beside the progress bar
 
 @dataclass(frozen=True)
 class BatchCounts:
-    """Numbers of scenes by outcome: `resumed` are done scenes of an earlier run; `warned` are done scenes with
-    warnings."""
+    """Numbers of scenes; `resumed` are done scenes of an earlier run, `warned` are done scenes with warnings."""
 
     done: int
     resumed: int
@@ -51,7 +50,6 @@ def run_batch(
     Args:
         source: a table or a folder of scenes, see `list_scenes`.
         out: folder of the results; made when missing.
-        config: the options of all scenes.
         masks: in each scene folder, or beside them; None: a detector finds them.
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
@@ -88,11 +86,7 @@ def run_batch(
 
 
 def _find_weights(config: RunConfig) -> RunConfig:
-    """Make the path of weights that do not ship absolute: workers may run elsewhere.
-
-    Raises:
-        InputError: there are no such weights.
-    """
+    """Make the path of weights that do not ship absolute: workers may run elsewhere."""
     from mvseg.detectors.zoo import find_weights, weights_path  # loads torchvision
 
     weights = config.detect.weights
@@ -104,11 +98,7 @@ def _find_weights(config: RunConfig) -> RunConfig:
 
 
 def _claim(out: Path, *, resume: bool) -> None:
-    """Make `out` the folder of a batch.
-
-    Raises:
-        InputError: it holds something else, or a batch that is not to be resumed.
-    """
+    """Make `out` the folder of a batch; InputError if it holds something else, or a batch that is not to be resumed."""
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file, expected a folder for the results")
     if (out / STATE).is_dir():

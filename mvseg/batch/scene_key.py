@@ -1,4 +1,4 @@
-"""What the result of a scene depends on, as one hash: a result with the same key need not be made again."""
+"""One hash of all that the result of a scene depends on: a result with the same key need not be made again."""
 
 from __future__ import annotations
 
@@ -22,10 +22,7 @@ def scene_key(scene: Scene, request: RunRequest) -> str:
 
     It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
     reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
-    files. Hidden files are ignored.
-
-    Raises:
-        InputError: a file cannot be read, or the weights are not there.
+    files. Hidden files are ignored. Raises InputError if a file cannot be read, or the weights are not there.
     """
     options, masks = asdict(request.config), request.masks
     try:

@@ -33,8 +33,7 @@ class BatchScene:
         masks: the path that the table gives, or that of `--masks`; None: a detector finds them.
         corrections: the path that the table gives to a file of corrections; None: there are none.
         beside: where a relative path of masks or corrections may start, besides the scene folder; absolute.
-        carried: its cells that are copied into all tables, {column: text}: `plant`, `time`, then the table's other
-            columns.
+        carried: {column: text} of the cells copied into all tables: `plant`, `time`, then other columns.
     """
 
     name: str
@@ -117,8 +116,7 @@ def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
 
 
 def _beside_table(source: Path, path: str | None) -> Path | None:
-    """A path from a cell: in the table's own folder if there is such a file, otherwise unchanged (in the scene
-    folder)."""
+    """A path from a cell: in the table's own folder if there is such a file, otherwise unchanged."""
     if not path:
         return None
     return (source.parent / path).absolute() if (source.parent / path).is_file() else Path(path)

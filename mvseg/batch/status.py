@@ -29,7 +29,6 @@ class Status(BaseModel, frozen=True):
         instances, masks, views: how many the result has.
         seconds: from the start of the scene to its result, or to its failure.
         peak_mb: the most memory that the process has used until then, in MB; None if the system does not report it.
-        warnings: the InputWarnings.
         sentence: why it failed.
         trace: the traceback, for failures that are bugs of mvseg.
     """

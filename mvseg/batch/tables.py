@@ -17,13 +17,9 @@ from mvseg.traits.table import COLUMNS, read_csv, wide_columns
 def write_tables(
     folder: Path, out: Path, scenes: Sequence[tuple[BatchScene, Status]], *, run: Mapping[str, Any]
 ) -> None:
-    """Write the folder of tables, whole or not at all; an earlier one is replaced, the user's files there stay.
-
-    The results of the scenes that are done lie in `out`; `run` goes into run.json besides counts.
-
-    Raises:
-        InputError: a result cannot be read, or `folder` cannot be replaced (see `replace_result`).
-    """
+    """Write the folder of tables, whole or not at all; an earlier one is replaced, the user's files there stay. The
+    results of the scenes that are done lie in `out`; `run` goes into run.json besides counts. Raises InputError if a
+    result cannot be read, or `folder` cannot be replaced (see `replace_result`)."""
     carried = list(scenes[0][0].carried)
     done = [scene for scene, status in scenes if status.state == "done"]
     summary = [[*_about(scene), *_outcome(status)] for scene, status in scenes]
@@ -38,11 +34,8 @@ def write_tables(
 
 
 def read_batch_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
-    """The rows of a table of a finished batch, which has these columns and perhaps others.
-
-    Raises:
-        InputError: `batch` is not the --out of a finished batch, or its table is broken.
-    """
+    """The rows of a table of a finished batch, which has these columns and perhaps others. Raises InputError if `batch`
+    is not the --out of a finished batch, or its table is broken."""
     path = batch / TABLES / name
     if not path.is_file():
         raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/{name} is missing)")

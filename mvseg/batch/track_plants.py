@@ -39,11 +39,8 @@ class TrackedPlant:
 
 
 def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
-    """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer.
-
-    Raises:
-        InputError: see `read_batch_table`; or no plant has two dates.
-    """
+    """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer. Raises
+    InputError as `read_batch_table`, or if no plant has two dates."""
     scenes: dict[str, list[tuple[str, str]]] = {}
     for row in read_batch_table(batch, "summary.csv", ("scene", "plant", "time", "state")):
         if row["state"] == "done":
@@ -69,13 +66,12 @@ def track_plants(
     scheduler: str | None = None,
     report: bool = True,
 ) -> list[TrackedPlant]:
-    """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced.
-
-    One plant is in memory at a time in each process. A plant that fails has a `sentence`; the others continue.
+    """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced. One plant is in memory
+    at a time in each process. A plant that fails has a `sentence`; the others continue.
 
     Args:
-        out: the tables of `write_track_tables`, tracks.html and run.json; of several plants, the pages
-            lie in `plants/`, and tracks.html is their list.
+        out: the tables of `write_track_tables`, tracks.html and run.json; of several plants, the pages lie in
+            `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.

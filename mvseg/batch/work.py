@@ -1,5 +1,4 @@
-"""What a worker does with one scene of a batch: it makes the result unless that exists; a failure becomes a sentence in
-the scene's status."""
+"""Work on one scene of a batch: its result is made unless it exists; a failure becomes a sentence in its status."""
 
 from __future__ import annotations
 
@@ -36,10 +35,7 @@ class Finished:
 
 def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     """Work on one scene, on one thread, while no other process does; `out` is the absolute folder of all results.
-
-    Raises:
-        OSError: the scene's status cannot be written.
-    """
+    Raises OSError if the scene's status cannot be written."""
     stay_on_one_thread()
     folder, place, started = scene_state(out, scene.name), out / scene.name, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)

@@ -37,22 +37,16 @@ TIMEOUT = 30  # limit: seconds, for a Dask scheduler to answer
 
 @dataclass(frozen=True)
 class Lost:
-    """The answer for an item whose worker died, or could not even report what went wrong.
-
-    Attributes:
-        reason: the end of a sentence: "the process that worked on it ...".
-    """
+    """The answer for an item whose worker died, or could not even report what went wrong; `reason` is the end of a
+    sentence: "the process that worked on it ..."."""
 
     reason: str
 
 
 @contextmanager
 def open_workers(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """Open workers that do `work` on items: `run_on_dask` where there is a scheduler, else `run_locally`.
-
-    Raises:
-        InputError: see `connect`.
-    """
+    """Open workers that do `work` on items: `run_on_dask` where there is a scheduler, else `run_locally`. Raises
+    InputError, see `connect`."""
     if scheduler is None:
         yield partial(run_locally, work, num_workers=num_workers)
     else:
@@ -68,17 +62,13 @@ def run_locally(
 ) -> Generator[tuple[int, Answer | Lost], None, None]:
     """The answers of `work` in the order in which they come, each with the key of its item.
 
-    Workers are spawned, use one thread, and end with this process, however that ends. When the iterator is closed
-    early, they are stopped at once.
+    At most `num_workers`, >= 1, are spawned; they use one thread, and end with this process, however that ends. When
+    the iterator is closed early, they are stopped at once. Raises InputError if none can be started.
 
     Args:
         work: what a module holds, or `partial` of it.
         items: items that can be pickled, by key.
         started: called with the key of an item when a worker takes it.
-        num_workers: at most that many processes, >= 1.
-
-    Raises:
-        InputError: no worker can be started.
     """
     todo = dict(items)
     asked: dict[Future[Any], tuple[int | None, ProcessPoolExecutor]] = {}  # None: whether the worker has started
@@ -129,14 +119,9 @@ def _stopped_with(error: BaseException) -> Lost:
 
 
 def connect(scheduler: str) -> Client:
-    """A client of a Dask scheduler.
-
-    Args:
-        scheduler: its address ("tcp://node-07:8786"), or the file that `dask scheduler --scheduler-file FILE` wrote.
-
-    Raises:
-        InputError: Dask is not installed, the file is missing or broken, or no scheduler answers.
-    """
+    """A client of a Dask scheduler, by its address ("tcp://node-07:8786"), or by the file that `dask scheduler
+    --scheduler-file FILE` wrote. Raises InputError if Dask is not installed, the file is missing or broken, or no
+    scheduler answers."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
@@ -164,14 +149,11 @@ def _read_scheduler_file(path: Path) -> str:
 def run_on_dask(
     work: Callable[[Item], Answer], items: Mapping[int, Item], started: Started, *, client: Client
 ) -> Generator[tuple[int, Answer | Lost], None, None]:
-    """As `run_locally`; `started` is called when an item is submitted, which all are at once.
+    """Run as `run_locally` does; `started` is called when an item is submitted, which all are at once.
 
     When a worker dies, the scheduler gives its items to others, up to `allowed-failures` times; then they are lost.
     When the iterator is closed early, items that no worker has started are cancelled; workers finish those that they
-    have started.
-
-    Raises:
-        InputError: a worker lacks mvseg, or the scheduler does not answer any more.
+    have started. Raises InputError if a worker lacks mvseg, or the scheduler does not answer any more.
     """
     from distributed import as_completed
 

@@ -15,11 +15,9 @@ PAPER, INK, FAULT, POINT = (255, 255, 255), (60, 60, 60), (215, 48, 39), (26, 15
 
 
 def draw_cameras(scene: Scene, coverage: Coverage, off: tuple[int, ...] = ()) -> NDArray[np.uint8]:
-    """(900, 900, 3) uint8 RGB: a plan of the cameras.
-
-    It shows the plane across `scene.up`, or the plane in which the cameras spread most. Cameras are arrows with their
-    numbers; red ones look past the point (a green dot) or are in `off`, the views whose poses are wrong.
-    """
+    """(900, 900, 3) uint8 RGB: a plan of the cameras. It shows the plane across `scene.up`, or the plane in which the
+    cameras spread most. Cameras are arrows with their numbers; red ones look past the point (a green dot) or are in
+    `off`, the views whose poses are wrong."""
     cameras = scene.cameras
     # axes (2, 3): the directions of the world that the picture shows as right and up
     away = cameras.centers.numpy() - cameras.centers.mean(0).numpy()

@@ -28,11 +28,9 @@ class Coverage:
     """A point that as many cameras as possible look at.
 
     Attributes:
-        point: (3,) world coordinates; of several that equally many cameras see, the one closest to the centres of the
-            photos.
+        point: (3,) world coordinates; of equally good ones, the closest to the centres of the photos.
         sees: (V,) bool, cameras that have it in their image and in front of them.
-        angle: (V,) degrees between the rays of each camera and its neighbour at the point; nan for cameras that do not
-            look at it, or are the only ones.
+        angle: (V,) degrees between the rays of each camera and its neighbour at the point; nan without such rays.
     """
 
     point: Floats
@@ -138,11 +136,7 @@ def field_of_view(cameras: Cameras) -> Floats:
 
 
 def _mixed_units(cameras: Cameras, coverage: Coverage) -> Rule | None:
-    """The rule about views whose t is in another unit than in the rest; None where there are none.
-
-    There are two lengths of t then, and with a factor between units all cameras look at one point from like distances.
-    Cameras that do so as they are have one unit, wherever the world's origin is.
-    """
+    """The rule about views whose t is in another unit; None without any: some factor makes all look at one point."""
     lengths = torch.linalg.vector_norm(cameras.t, dim=1)
     order = lengths.argsort()
     ordered = lengths[order].clamp(min=1e-300)
@@ -172,11 +166,7 @@ def _distance_ratio(cameras: Cameras, coverage: Coverage, is_short: Tensor) -> f
 
 
 def _other_reading(cameras: Cameras, coverage: Coverage) -> Rule | None:
-    """The rule about what R and t seem to be instead; None if they seem right.
-
-    Inverted poses may still look at one point: cameras around a plant then stand close together and look in one
-    direction, each rotated about its own axis.
-    """
+    """The rule about what R and t seem to be instead; None if they seem right."""
     R, t, flip = cameras.R, cameras.t, torch.from_numpy(FLIP)
     readings = {
         "inverse_poses": replace(cameras, R=R.mT, t=cameras.centers),

@@ -24,7 +24,6 @@ class Check:
     """Outcome of the checks of a scene.
 
     Attributes:
-        scene: that was checked.
         regions: its masks, None without any.
         findings: the gravest first; empty for a sound scene that says its unit and up.
         coverage: what the cameras look at.

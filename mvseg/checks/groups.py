@@ -19,11 +19,9 @@ Floats = NDArray[np.float64]
 
 
 def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
-    """Groups of two or more views that agree within themselves and not with each other, the largest first.
-
-    Views that agree with none, or have no masks to compare, are in no group. There is a single group where all agree,
-    and none where most views agree with none.
-    """
+    """Groups of two or more views that agree within themselves and not with each other, the largest first. Views that
+    agree with none, or have no masks to compare, are in no group. There is a single group where all agree, and none
+    where most views agree with none."""
     views = view_agreement(pairs)
     if not views.agree:
         return ()
@@ -63,8 +61,7 @@ def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.
 
 
 def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Order the members so that those that agree are neighbours: by the second eigenvector of the graph's Laplacian
-    (the Fiedler vector of the normalized cut, Shi and Malik 2000)."""
+    """Order members so that those that agree are neighbours, by the Fiedler vector (Shi and Malik 2000)."""
     weight = np.nan_to_num(pairs.fitting[np.ix_(members, members)]).clip(AGREEMENT.chance / 10)
     np.fill_diagonal(weight, 0)
     root = np.sqrt(weight.sum(1))
@@ -83,8 +80,7 @@ def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.in
 
 
 def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
-    """Whether epipolar lines miss in half of the pairs between two groups, but not within both: one of them may be of
-    two worlds itself."""
+    """Whether epipolar lines miss in half of the pairs between two groups, but not within both."""
     of_groups = [_upper(pairs.offset, one), _upper(pairs.offset, other)]
     within = [np.nanmedian(offsets) for offsets in of_groups if not np.isnan(offsets).all()]
     return bool(np.nanmedian(_block(pairs.offset, one, other)) >= AGREEMENT.offset > min(within))

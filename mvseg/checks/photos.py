@@ -28,8 +28,6 @@ class PhotoFacts:
         size: width and height as stored; None for a photo that is missing or cannot be read.
         problem: why it cannot be read; "" otherwise, also for a missing one.
         turned: EXIF asks viewers to turn it.
-        content: what it shows.
-        digest: hash of the file.
         exposure: see `read_exposure`.
     """
 

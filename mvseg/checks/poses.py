@@ -1,5 +1,4 @@
-"""Do the masks of the views agree with the poses? Judged by the epipolar lines tangent to the masks, without any
-matching.
+"""Agreement of masks with poses, judged by the epipolar lines tangent to the masks, without any matching.
 
 A leaf that is fully visible in two photos is tangent to the same two half-planes of the views' pencil: its mask begins
 and ends at the same angles in both. So with correct poses many masks of a view have a mask in another view with the
@@ -73,11 +72,8 @@ class _Spans:
 
 
 def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
-    """How the masks of each pair of views agree with the poses.
-
-    Masks that touch the border are left out: where they would end is not known. With more than 20 other views, each is
-    compared with 20 or more of them.
-    """
+    """How the masks of each pair of views agree with the poses. Masks that touch the border are left out: where they
+    would end is not known. With more than 20 other views, each is compared with 20 or more of them."""
     num_views = len(cameras)
     regions, cameras = regions.to("cpu"), cameras.to("cpu")
     regions = regions.select(~touches_border(regions, cameras))
@@ -101,11 +97,8 @@ def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
 
 def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
     """Find the views that agree: the worst one that agrees with none is set apart, again and again, until the others
-    agree.
-
-    A view agrees with none if hardly more of its masks fit than by chance, and the lines miss in most other views. The
-    rest must be more than half of the views, and at least two.
-    """
+    agree. A view agrees with none if hardly more of its masks fit than by chance, and the lines miss in most other
+    views. The rest must be more than half of the views, and at least two."""
     num_views = len(pairs.fitting)
     agreeing, off = list(range(num_views)), []
     while len(agreeing) > 1:
@@ -124,11 +117,9 @@ def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
 
 
 def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
-    """Views whose poses and masks contradict the others.
-
-    An error for each view that agrees with none, or one for the whole scene if most do not (warnings where views or
-    masks are few); a warning for lines that miss a little. Nothing where there are no masks to compare.
-    """
+    """Views whose poses and masks contradict the others. An error for each view that agrees with none, or one for the
+    whole scene if most do not (warnings where views or masks are few); a warning for lines that miss a little. Nothing
+    where there are no masks to compare."""
     view = view_agreement(pairs)
     compared = pairs.num_masks[pairs.num_masks > 0]
     if not len(compared):
@@ -170,8 +161,7 @@ def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
 
 
 def _hull_corners(regions: Regions) -> Tensor:
-    """(D, P, 2) float64, the corners of the regions' hulls, pixel centres; the first is repeated where there are
-    fewer."""
+    """(D, P, 2) float64 corners of the regions' hulls, pixel centres; the first is repeated where there are fewer."""
     hulls = [_hull(regions, index) for index in range(len(regions))]
     most = max((len(hull) for hull in hulls), default=1)
     padded = [torch.cat((hull, hull[:1].expand(most - len(hull), 2))) for hull in hulls]
@@ -196,16 +186,14 @@ def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
 
 
 def _residuals(first: _Spans, second: _Spans, moves: Tensor) -> Tensor:
-    """(S, N, M) pixels: how far the masks of two views are from beginning and ending together, after S moves (S, M) of
-    the second view's masks, radians."""
+    """(S, N, M) pixels between the ends of two views' masks, after S moves (S, M) of the second's, radians."""
     apart = first.ends[:, None] - second.ends
     px = torch.hypot(first.pitch[:, None], second.pitch)
     return ((apart - moves[:, None, :, None]) / px).abs().amax(3)
 
 
 def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:
-    """(N,) and (M,) bool: the best partner fits better than under any of the moves, which keep the masks where masks
-    are: they go round within the angles that the second view's masks cover."""
+    """(N,) and (M,) bool: the best partner fits better than under any move; moves stay where masks are."""
     middle = second.ends.mean(1)
     reach = torch.maximum(middle.max() - middle.min(), (second.ends[:, 1] - second.ends[:, 0]).mean())
     low = (middle.max() + middle.min() - reach) / 2

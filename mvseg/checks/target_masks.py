@@ -18,18 +18,13 @@ LUMA = np.array([0.299, 0.587, 0.114])  # brightness as JPEG has it
 
 
 def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floats]]) -> NDArray[np.uint16]:
-    """Label map of the shapes of one photo: (H, W), 0 where no shape is.
-
-    A mask is what differs in colour from the paper of its cell. The outline only decides whether it is the shape: its
-    edge plays no part in the mask.
+    """Label map (H, W) of the shapes that were found in one photo (H, W, 3) RGB, 0 where none is. A mask is what
+    differs in colour from the paper of its cell. The outline only decides whether it is the shape: its edge plays no
+    part in the mask.
 
     Args:
-        photo: (H, W, 3) RGB.
         places: {label: cell and outline}, where they should be: (4, 2) pixels around the shape and white paper, which
             may lie partly outside; and (P, 2) pixels of the shape, all in the photo.
-
-    Returns:
-        The labels of the shapes that were found.
     """
     height, width = photo.shape[:2]
     labels = np.zeros((height, width), np.uint16)
@@ -45,11 +40,7 @@ def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floa
 
 
 def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(h, w) bool: the largest piece of a cell that differs from paper, its holes (reflections) filled.
-
-    Each pixel is a mixture of paper and ink, in some light. The edge is where both have half, by brightness: JPEG blurs
-    colours, which makes shapes larger, but not brightness.
-    """
+    """(h, w) bool: the largest piece of a cell that is ink by half or more, by brightness; reflections are filled."""
     light = ((part + 1.0) / 256) ** IMAGES.gamma
     lack = 1 - 2 * light[..., 1] / (light[..., 0] + light[..., 2])  # of green, in any light and shade: magenta
     is_ink = lack > threshold_otsu(lack[is_cell])

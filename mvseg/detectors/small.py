@@ -29,14 +29,9 @@ SMALL_ARCHITECTURES = (*SMALL_BACKBONES, *LITE_SCALES)
 
 
 def build_small(arch: str, num_classes: int, backbone_weights: str | None = None) -> MaskRCNN:
-    """A small detector with batch norms, as torchvision's classifiers have them; levels "0" to "3" and "pool" (strides
-    4 to 64).
-
-    Args:
-        arch: one of `SMALL_ARCHITECTURES`.
-        num_classes: classes with the background.
-        backbone_weights: a name of weights of torchvision's classifier, to be downloaded; None: random.
-    """
+    """Build one of `SMALL_ARCHITECTURES` with batch norms, as torchvision's classifiers have them; levels "0" to "3"
+    and "pool" (strides 4 to 64). `num_classes` counts the background; `backbone_weights` is a name of weights of
+    torchvision's classifier, to be downloaded; None: random."""
     if arch in LITE_SCALES:
         # group norm: the published weights give features with a standard deviation of 3 to 8, too large for the heads
         norm = partial(nn.GroupNorm, CHANNELS // 16)
@@ -77,11 +72,9 @@ def add_light_heads(backbone: nn.Module, num_classes: int, **options: Any) -> Ma
 
 
 def build_mask_head(channels: int) -> MaskRCNNHeads:
-    """torchvision's four convolutions, dilated: a pixel of the (D, channels, 14, 14) crops sees 17 x 17, not 9 x 9.
-
-    A box around a thin slanted leaf holds more of other leaves than of its own; which leaf reaches all four of its
-    sides can only be seen from afar.
-    """
+    """torchvision's four convolutions, dilated: a pixel of the (D, channels, 14, 14) crops sees 17 x 17, not 9 x 9. A
+    box around a thin slanted leaf holds more of other leaves than of its own; which leaf reaches all four of its sides
+    can only be seen from afar."""
     head = MaskRCNNHeads(channels, (channels,) * len(MASK_DILATIONS), 1)
     for layer, dilation in zip(head, MASK_DILATIONS, strict=True):
         layer[0].dilation = layer[0].padding = (dilation, dilation)

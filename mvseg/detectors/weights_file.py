@@ -24,13 +24,8 @@ MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # limit: pixels that photos are sca
 
 @dataclass(frozen=True)
 class Description:
-    """Description of a detector in its weights file.
-
-    Attributes:
-        arch: architecture, see `list_architectures`.
-        categories: names of the classes, without background.
-        image_size: longer side, in pixels, that photos are scaled to.
-    """
+    """Description of a detector in its weights file: architecture, see `list_architectures`; categories without
+    background; and the longer side, in pixels, that photos are scaled to."""
 
     arch: str
     categories: tuple[str, ...]
@@ -55,13 +50,9 @@ def _sort_metadata(content: bytes) -> bytes:
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], Description | None]:
-    """State dict and description of a weights file; None where it has no description.
-
-    Of a checkpoint that holds a moving average, that is what is read.
-
-    Raises:
-        InputError: no such file, neither a .safetensors nor a checkpoint of tensors, or a malformed description.
-    """
+    """State dict and description of a weights file; None where it has no description. Of a checkpoint that holds a
+    moving average, that is what is read. Raises InputError if there is no such file, it is neither a .safetensors nor a
+    checkpoint of tensors, or the description is malformed."""
     if not path.is_file():
         raise InputError(f"weights '{path}' are neither a file nor a name that torchvision has for this architecture")
     try:
@@ -102,11 +93,8 @@ def _read_description(path: Path, metadata: Mapping[str, str]) -> Description | 
 
 
 def load_weights(model: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Load a state dict that must fit exactly.
-
-    Raises:
-        InputError: a missing, unknown or differently shaped parameter; the message is a reason that names the first.
-    """
+    """Load a state dict that must fit exactly. Raises InputError, a reason that names the first missing, unknown or
+    differently shaped parameter."""
     try:
         keys = model.load_state_dict(dict(state), strict=False)
     except RuntimeError as error:

@@ -36,14 +36,7 @@ HOMES = (Path(str(files("mvseg") / "zoo")), Path(str(files("mvseg"))).parent / "
 
 @dataclass(frozen=True)
 class ZooEntry:
-    """Detector that ships under one name.
-
-    Attributes:
-        name: of the folder.
-        weights: its weights file.
-        sha256: of the weights, as the folder states it.
-        metrics: content of metrics.json.
-    """
+    """Detector that ships under the name of its folder; `sha256` is that of the weights, as the folder states it."""
 
     name: str
     weights: Path
@@ -52,11 +45,8 @@ class ZooEntry:
 
 
 def list_detectors() -> tuple[ZooEntry, ...]:
-    """The shipped detectors, sorted by name; the hash is read here and checked by `find_weights`.
-
-    Raises:
-        InputError: a folder lacks its metrics, or its hash cannot be read.
-    """
+    """The shipped detectors, sorted by name; the hash is read here and checked by `find_weights`. Raises InputError if
+    a folder lacks its metrics, or its hash cannot be read."""
     return tuple(_read_entry(folder) for _, folder in sorted(_list_folders().items()))
 
 
@@ -74,11 +64,8 @@ def _read_entry(folder: Path) -> ZooEntry:
 
 
 def find_weights(name: str) -> Path | None:
-    """The weights file of a shipped detector, its hash checked; None when none of that name ships.
-
-    Raises:
-        InputError: the file is missing, or its SHA-256 is not the one stated beside it.
-    """
+    """The weights file of a shipped detector, its hash checked; None when none of that name ships. Raises InputError if
+    the file is missing, or its SHA-256 is not the one stated beside it."""
     folder = _list_folders().get(name)
     if folder is None:
         return None
@@ -94,11 +81,7 @@ def find_weights(name: str) -> Path | None:
 
 def weights_path(name: str | Path) -> Path:
     """The weights file of a shipped detector, or that of a result whose plant a detector has learned, or else the path
-    itself, which need not exist; see `find_weights`.
-
-    Raises:
-        InputError: it is a folder without a detector that has learned.
-    """
+    itself, which need not exist; see `find_weights`. Raises InputError for a folder without a learned detector."""
     if (shipped := find_weights(str(name))) is not None or not Path(name).is_dir():
         return shipped or Path(name)
     learned = Path(name) / DETECTOR_FILE

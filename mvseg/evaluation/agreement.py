@@ -38,9 +38,8 @@ class Agreement:
 
 
 def compare_annotators(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> Agreement:
-    """Compare masks with ids, of one annotator, with the label maps of another; see `leaf_metrics` for the arguments
-    and what it raises. Exchanged, they have the same shared leaves, as long as masks of one view do
-    not overlap."""
+    """Compare masks with ids, of one annotator, with the label maps of another; arguments and errors as in
+    `leaf_metrics`. Exchanged, they have the same shared leaves, as long as masks of one view do not overlap."""
     judged = find_all(regions, instance_ids, truth)
     leaves = zip(judged.ids.tolist(), judged.leaves.true_segment.tolist(), judged.leaves.iou.tolist(), strict=True)
     found = {leaf: SharedLeaf(leaf, judged.labels[true], iou) for leaf, true, iou in leaves if true >= 0}

@@ -39,13 +39,8 @@ def annotate_truth(labelled: LabelledPhoto, image_id: int, num_categories: int) 
 
 
 def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], image_id: int) -> Annotations:
-    """COCO annotations of the detections in photo 0, 1, ...
-
-    Args:
-        detections: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,).
-        masks: D masks (H, W) of probabilities, cut at 0.5 here, as torchvision's are by convention.
-        image_id: number of the photo.
-    """
+    """COCO annotations of the detections in photo 0, 1, ...: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,); and D
+    masks (H, W) of probabilities, cut at 0.5 here, as torchvision's are by convention."""
     columns = (detections[key].tolist() for key in ("boxes", "labels", "scores"))
     return [
         describe_mask(mask > 0.5, image_id)
@@ -62,12 +57,8 @@ def describe_mask(mask: Tensor, image_id: int) -> dict[str, Any]:
 
 
 def average_precision(truth: Annotations, detections: Annotations, num_images: int) -> dict[str, float | None]:
-    """COCO's average precision of masks and of boxes.
-
-    Args:
-        truth: annotations of the true instances, see `annotate_truth`.
-        detections: annotations with "score", see `annotate_detections`.
-        num_images: image ids are 0..num_images - 1; images without any annotation count.
+    """COCO's average precision of masks and of boxes, of annotations by `annotate_truth` and `annotate_detections`;
+    image ids are 0..num_images - 1, and images without any annotation count.
 
     Returns:
         "mask_AP", "mask_AP50", "mask_AP75", "mask_AR" and the same for "box": in [0, 1], the mean over classes (AP, AR:

@@ -26,9 +26,7 @@ class MatchingMetrics:
         pair_precision: of the pairs put together, the share that belongs together (1 when no pair is put together).
         pair_recall: of the pairs that belong together, the share put together (1 when there is none).
         pair_f1: their harmonic mean.
-        num_regions: D.
         num_estimated: estimated clusters, single regions included.
-        num_true: true instances.
     """
 
     s_match: float

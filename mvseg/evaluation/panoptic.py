@@ -57,7 +57,6 @@ class SegmentMatches:
         true_segment: (P,) int64, the true segment that each one finds, -1 for none.
         iou: (P,) float64 with it, 0 for none.
         is_false: (P,) bool: finds nothing, and is not mostly ignored.
-        num_true: T.
     """
 
     true_segment: np.ndarray
@@ -92,16 +91,14 @@ class Judged:
 
 
 def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> LeafMetrics:
-    """Judge masks with ids by true label maps.
+    """Judge masks with ids by true label maps. Raises InputError for another number of ids than of regions, or of maps
+    than of views.
 
     Args:
         regions: D estimated masks in V views; they may overlap.
         instance_ids: (D,) int64, -1 = matched to nothing: an instance of its own.
         truth: V integer label maps (H, W) in the frames of the regions, the same number for the same instance in every
             view; 0 = no instance, 65535 = ignore.
-
-    Raises:
-        InputError: another number of ids than of regions, or of maps than of views.
     """
     judged = find_all(regions, instance_ids, truth)
     masks, leaves = judged.masks, judged.leaves
@@ -148,13 +145,9 @@ def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]
 def find_segments(
     regions: Regions, segments: np.ndarray, truth: Sequence[np.ndarray], *, numbers: Sequence[Mapping[int, int]]
 ) -> SegmentMatches:
-    """Match estimated segments to true ones; of several, the one with the largest IoU counts.
-
-    Args:
-        segments: (D,) int64 from 0 on without gaps, the segment that each mask is a part of.
-        truth: V label maps.
-        numbers: V mappings, label -> true segment, from 0 on without gaps.
-    """
+    """Match estimated segments to true ones; of several, the one with the largest IoU counts. `segments` (D,) int64 is
+    the segment that each mask is a part of, `truth` are V label maps, and `numbers` V mappings, label -> true segment;
+    segments are numbered from 0 on without gaps."""
     num_segments = int(segments.max(initial=-1)) + 1
     num_true = len({number for of_view in numbers for number in of_view.values()})
     shared = np.zeros((num_segments, num_true), np.int64)
@@ -193,17 +186,9 @@ def _covered_labels(
 
 
 def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray) -> tuple[int, int, int]:
-    """Pairs of masks that belong together.
-
-    Args:
-        masks: D estimated masks against T true ones.
-        ids: (D,) int64, the estimated instance of each mask.
-        leaf: (T,) int64, the true instance of each true mask.
-
-    Returns:
-        Number of pairs of estimated masks with one id that find one instance; of pairs with one id (masks that are
-        mostly ignored and find nothing aside); of pairs of true masks of one instance.
-    """
+    """Count pairs of estimated masks with one id that find one instance; pairs with one id (masks that are mostly
+    ignored and find nothing aside); and pairs of true masks of one instance. `ids` (D,) int64 is the estimated instance
+    of each mask, `leaf` (T,) int64 the true instance of each true mask."""
     is_right = masks.true_segment >= 0
     together = contingency_table(leaf[masks.true_segment[is_right]], ids[is_right])
     estimated = np.bincount(ids[is_right | masks.is_false])

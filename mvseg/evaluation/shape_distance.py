@@ -1,4 +1,4 @@
-"""How far a shape is from the true one: d(I, T) of Sec. 4.3."""
+"""Distance of a shape from the true one: d(I, T) of Sec. 4.3."""
 
 from __future__ import annotations
 

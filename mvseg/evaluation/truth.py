@@ -1,4 +1,4 @@
-"""Which true instance a mask shows."""
+"""True instances that masks show."""
 
 from __future__ import annotations
 
@@ -12,16 +12,12 @@ from mvseg.regions import Regions
 
 
 def true_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: bool = True) -> int:
-    """The true instance that one mask shows: the most frequent true label under it.
+    """The true instance that one mask shows: the most frequent true label under it, the smallest of equals.
 
-    Args:
-        truth: (H, W) integers: 0 = no instance, 65535 = ignore.
-        mask: (H, W), not 0 inside the mask.
-        count_background: False for masks that are known to show an instance but may extend beyond it.
-
-    Returns:
-        The label, the smallest of equally frequent ones. 0 for a mask without pixels, for one that mostly covers no
-        instance, or, without `count_background`, covers none at all. 65535 for a mask that is mostly ignored.
+    `truth` (H, W) has integers: 0 = no instance, 65535 = ignore; `mask` (H, W) is not 0 inside. `count_background` is
+    False for masks that are known to show an instance but may extend beyond it. Returns 0 for a mask without pixels,
+    for one that mostly covers no instance, or, without `count_background`, covers none at all; 65535 for a mask that is
+    mostly ignored.
     """
     counts = np.bincount(truth[mask != 0].ravel(), minlength=1)
     if not count_background:

@@ -31,12 +31,8 @@ class _Cameras(RootModel[dict[int, _Camera]]):
 
 
 def read_bop(path: Path) -> Scene:
-    """The scene of a scene_camera.json, views in the order of their numbers, called 000000, 000001, ...
-
-    Raises:
-        InputError: the file is missing or broken, an image has no pose (BOP allows that) or no photo, or a camera is
-            unsound; see `build_scene`.
-    """
+    """Read a scene_camera.json, views by number, called 000000, 000001, ... Raises InputError if the file is missing or
+    broken, an image has no pose (BOP allows that) or no photo, or a camera is unsound; see `build_scene`."""
     cameras = read_json(path, _Cameras).root
     photos = []
     for number, camera in sorted(cameras.items()):

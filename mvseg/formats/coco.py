@@ -79,19 +79,17 @@ _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[Fi
 def read_coco(
     path: Path, scene: Scene, *, parts: Sequence[Path] = (), crowd: Crowd = "mask", categories: Collection[str] = ()
 ) -> list[Iterator[tuple[int, np.ndarray]]]:
-    """The masks of a COCO file, view by view, in the frame of the photo.
-
-    Masks are decoded lazily: hundreds of masks of large photos do not fit into memory together.
+    """The masks of a COCO file, view by view, in the frame of the photo. Masks are decoded lazily: hundreds of masks of
+    large photos do not fit into memory together.
 
     Images are found by file name, see `find_views`; those that are not in the scene are left out. A list of results
     (annotations alone) is read, too: its images are those of the COCO file beside it that lists their ids; without one,
-    `image_id` is the name of a photo, or the number that it consists of.
-    Warns (InputWarning) of everything that is left out, guessed or ambiguous: crowds, boxes without a mask, views that
-    the file does not list, annotations of images that it does not list, several categories.
+    `image_id` is the name of a photo, or the number that it consists of. Warns (InputWarning) of everything that is
+    left out, guessed or ambiguous: crowds, boxes without a mask, views that the file does not list, annotations of
+    images that it does not list, several categories.
 
     Args:
         path: the file; of several, their folder, which messages name.
-        scene: gives the views and their sizes.
         parts: the files, where one was split by photos (Roboflow's train, valid and test).
         crowd: how annotations with `iscrowd` are treated: "mask": as all others (supervision sets it for every mask
             with holes or several parts, datumaro for all masks); "ignore": left out, as in COCO's own evaluation.
@@ -182,12 +180,7 @@ def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoMasks | Non
 
 
 def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) -> list[CocoImage]:
-    """The images of a list of results by their ids alone: the name of a photo, or the number that its name is, which is
-    a guess, and said.
-
-    Raises:
-        InputError: some of the ids are such numbers, and others are not.
-    """
+    """Guess the images of a list of results by their ids: the name of a photo, or the number that its name is."""
     stems = [base_name(view.name) for view in scene.views]
     by_number = {int(stem): view.name for stem, view in zip(stems, scene.views, strict=True) if stem.isdecimal()}
     if len(by_number) < len(stems):  # not every photo has a number of its own
@@ -276,13 +269,8 @@ def _decode_all(
 
 
 def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarray:
-    """(height, width) bool mask of an annotation's "segmentation": polygons, run lengths, or compressed run lengths; or
-    a single polygon without a list around it, as VIA writes.
-
-    Args:
-        segmentation: as json read it, unchecked.
-        width: of the image, pixels.
-        height: of the image, pixels.
+    """(height, width) bool mask of an annotation's "segmentation", unchecked, as json read it: polygons, run lengths,
+    plain or compressed, or a single polygon without a list around it, as VIA writes.
 
     Raises:
         InputError: another form, a number that is not finite, another size, run lengths that do not add up to the
@@ -321,12 +309,9 @@ def is_bitmap(segmentation: Any, height: int) -> bool:
 
 
 def check_segmentations(segmentations: Iterable[tuple[Any, Sequence[int]]]) -> None:
-    """Check all masks of a file, each with the width and height of its photo, for a form that would be misread.
-
-    Raises:
-        InputError: all corners of the polygons lie between 0 and 1, as shares of the size do; many lie outside of the
-            photos, as those of larger ones do; or run lengths go along the rows.
-    """
+    """Check all masks of a file, each with the width and height of its photo, for a form that would be misread. Raises
+    InputError if all corners of the polygons lie between 0 and 1, as shares of the size do; many lie outside of the
+    photos, as those of larger ones do; or run lengths go along the rows."""
     polygons, down, across = [], 0.0, 0.0
     for segmentation, (width, height) in segmentations:
         if isinstance(segmentation, list) and segmentation and not is_bitmap(segmentation, height):
@@ -361,8 +346,7 @@ def _is_share(number: Any) -> bool:
 
 
 def _decode_polygons(polygons: list[list[float]], width: int, height: int) -> np.ndarray:
-    """pycocotools walks along every edge in steps of a fifth of a pixel and keeps them all: distant corners, or many
-    long edges, would need unbounded memory."""
+    """Decode polygons; distant corners and many long edges, unbounded memory for pycocotools, are refused."""
     if not any(polygons) or any(len(polygon) % 2 for polygon in polygons):
         raise InputError("its segmentation is not of the expected polygons x1, y1, x2, y2, x3, y3 and so on")
     polygons = [polygon for polygon in polygons if len(polygon) >= 6]

@@ -24,12 +24,9 @@ def is_colmap_model(folder: Path) -> bool:
 
 
 def find_colmap_model(folder: Path) -> Path | None:
-    """The COLMAP model of a scene folder: `sparse/` itself, or the folder of `sparse/` (else of `colmap/sparse/`) whose
-    model has the most photos, the first of equals; None if there is none.
-
-    COLMAP writes `sparse/0`, `sparse/1`, ... where it could not connect all photos. Warns (InputWarning) of the models
-    that are not taken: each has a world of its own.
-    """
+    """Find the COLMAP model of a scene folder: `sparse/` itself, or the folder of `sparse/` (else of `colmap/sparse/`)
+    whose model has the most photos, the first of equals; None if there is none. COLMAP writes `sparse/0`, `sparse/1`,
+    ... where it could not connect all photos. Warns (InputWarning) of all other models: each has its own world."""
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         if is_colmap_model(place):
             return place
@@ -58,15 +55,11 @@ def _count_photos(model: Path) -> int:
 
 
 def read_colmap(model: Path, folder: Path) -> Scene:
-    """The scene of a COLMAP model; views in the order of their image names; the unit is unknown ("").
+    """Read a COLMAP model, the folder of cameras, images and points3D (.bin or .txt); the unit is unknown ("").
 
-    Args:
-        model: the folder of cameras, images and points3D (.bin or .txt).
-        folder: the scene; photos are expected in its `images/`. Images that COLMAP did not register are left out.
-
-    Raises:
-        InputError: the model cannot be read or is truncated, a camera is not perspective (EQUIRECTANGULAR); see also
-            `build_scene`.
+    Views are in the order of their image names; images that COLMAP did not register are left out. Photos are expected
+    in the `images/` of `folder`. Raises InputError if the model cannot be read or is truncated, or a camera is not
+    perspective (EQUIRECTANGULAR); see also `build_scene`.
     """
     _check_binary_model(model)
     try:
@@ -89,8 +82,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
 
 
 def _list_names(path: Path) -> Iterator[tuple[int, str]]:
-    """The id and the name of each image of a text model, two lines each, after pycolmap has read the other fields: it
-    cuts names at a space. Nothing of a binary model, which pycolmap prefers."""
+    """Ids and names of the images of a text model, which pycolmap cuts at a space; nothing of a binary model."""
     if path.with_suffix(".bin").is_file() or not path.is_file():
         return
     with path.open(encoding="utf-8") as file:
@@ -117,12 +109,7 @@ def _photo(model: Path, image: pycolmap.Image, lens: pycolmap.Camera) -> Photo:
 
 
 def _check_binary_model(model: Path) -> None:
-    """Check every binary file of a model, record by record: of a truncated file pycolmap 4.2 may accept half, never
-    return, or allocate gigabytes. Text models need no check.
-
-    Raises:
-        InputError: a file cannot be read, does not end where its own counts say, or names an unknown camera model.
-    """
+    """Refuse a truncated binary model: pycolmap 4.2 may accept half of it, never return, or allocate gigabytes."""
     for name, record_end in RECORD_ENDS.items():
         path = model / name
         if not path.is_file():

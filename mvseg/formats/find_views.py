@@ -1,4 +1,4 @@
-"""Which view a file name refers to: mask files come from other machines and tools, with their own naming."""
+"""Views by the names of files: mask files come from other machines and tools, with their own naming."""
 
 from __future__ import annotations
 
@@ -68,8 +68,7 @@ def find_views(
 
 
 def base_name(name: str) -> str:
-    """A file name without folders, the suffixes of images, Roboflow's ending and Label Studio's prefix, in small
-    letters."""
+    """A file name in small letters, without folders, image suffixes, Roboflow's ending and Label Studio's prefix."""
     last = composed(name).replace("\\", "/").rsplit("/", 1)[-1]
     while "." in last and f".{last.rsplit('.', 1)[1].lower()}" in PHOTO_SUFFIXES:
         last = last.rsplit(".", 1)[0]
@@ -82,8 +81,7 @@ def composed(name: str) -> str:
 
 
 def find_file(path: Path) -> Path:
-    """The file of a name, or else one beside it whose name differs in Unicode's form only; the path itself, if there is
-    none."""
+    """The file of a name, or one beside it whose name differs in Unicode's form only; else the path itself."""
     if str(path).isascii() or path.exists():
         return path
     place = Path(path.anchor)

@@ -21,11 +21,8 @@ QUARTERS = (1, 8, 3, 6)  # definition: a turn by 0 to 3 quarters, anticlockwise,
 
 
 def open_heic(file: IO[bytes]) -> ImageFile:
-    """The main image of a file, not decoded yet; its `info` has `TURN`.
-
-    Raises:
-        InputError: pi_heif is not installed, or the image is mirrored.
-    """
+    """The main image of a file, not decoded yet; its `info` has `TURN`. Raises InputError if pi_heif is not installed,
+    or the image is mirrored."""
     try:
         from pi_heif import HeifImageFile
     except ImportError:
@@ -38,11 +35,8 @@ def open_heic(file: IO[bytes]) -> ImageFile:
 
 
 def find_turn(data: bytes) -> int:
-    """How decoders turn the main image of a HEIC file, 1 to 8 as in EXIF.
-
-    Raises:
-        InputError: it is mirrored, too, or the file does not say what its main image is.
-    """
+    """Read how decoders turn the main image of a HEIC file, 1 to 8 as in EXIF. Raises InputError if it is also
+    mirrored, or the file does not say what its main image is."""
     meta = _content(data, b"meta")[4:]
     main, properties = _content(meta, b"pitm"), _content(meta, b"iprp")
     wanted = _linked(_content(properties, b"ipma"), int.from_bytes(main[4:]))

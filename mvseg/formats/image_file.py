@@ -66,13 +66,8 @@ class WrongSize(InputError):
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a JPEG, PNG, TIFF, BMP, WebP or HEIC file, recognised by its content; the first image of several.
-
-    Args:
-        size: width and height that the image must have, in this or the other order; another one is not decoded.
-
-    Returns:
-        The pixels as the file has them, in one of Pillow's modes.
+    """Decode a JPEG, PNG, TIFF, BMP, WebP or HEIC file, recognised by its content, into one of Pillow's modes; the
+    first image of several. One whose sides are not those of `size`, in either order, is not decoded.
 
     Raises:
         WrongSize: an image of another size.
@@ -122,11 +117,7 @@ def _turn_back(image: ImageFile, turn: int) -> Image.Image:
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, as stored; only the header of the file is read.
-
-    Raises:
-        InputError: as `read_image`, as far as the header shows.
-    """
+    """Width and height in pixels, as stored, by the header. Raises InputError as `read_image`, as far as that shows."""
     with _any_fault(), path.open("rb") as file:
         reader = _find_reader(file.read(16))
         file.seek(0)
@@ -159,15 +150,9 @@ def _find_reader(start: bytes) -> Callable[[IO[bytes]], ImageFile]:
 def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) -> np.ndarray:
     """(H, W, 3) uint8: the image as RGB, without transparency; of 16 bits, the upper 8.
 
-    Files of 16 bits that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of
-    those; see `sensor_bits`.
-
-    Args:
-        bits: least number of bits that a 16-bit file is taken to use: that of the other photos, so that a dark photo
-            stays darker than they are.
-
-    Raises:
-        InputError: see `read_image`; or the pixels are signed, or have 32 bits.
+    16-bit files that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of those;
+    see `sensor_bits`. They are taken to use `bits` or more, as the other photos do: a dark photo stays darker. Raises
+    InputError as `read_image`, or if pixels are signed or have 32 bits.
     """
     image = read_image(path, size)
     deep = read_deep(path, image)
@@ -186,11 +171,9 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
 
 
 def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
-    """How many bits the numbers of an image use: 8, or 10, 12, 14 or 16 in a file of 16 bits.
-
-    8 also for a file that cannot be read or has another size (see `read_image`). Only files of 16 bits are decoded; the
-    answer is cached until the file changes.
-    """
+    """Number of bits that an image uses: 8, or 10, 12, 14 or 16 in a file of 16 bits; 8 also for a file that cannot be
+    read or has another size (see `read_image`). Only 16-bit files are decoded; the answer is cached until the file
+    changes."""
     try:
         facts = path.stat()
         return _bits_of_file(path, size, facts.st_mtime_ns, facts.st_size)
@@ -318,8 +301,7 @@ def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | N
 
 
 def _load(image: ImageFile) -> None:
-    """Decode the pixels. Pillow's own limit is one number for the whole process; our larger one replaces it only while
-    a large file is decoded."""
+    """Decode the pixels; only for a large file, our limit replaces Pillow's, one number for the whole process."""
     if image.width * image.height < LARGE:
         image.load()
         return
@@ -346,11 +328,7 @@ def _has_sound_chunks(data: bytes) -> bool:
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
-    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB. Raises OSError if the file cannot be written."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".png", pixels)
     path.write_bytes(encoded.tobytes())

@@ -29,20 +29,13 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_json(path: Path, model: type[Model]) -> Model:
-    """Read a JSON file as `model`.
-
-    Raises:
-        InputError: the file is missing, is not JSON, or does not fit the model; names the file and the key.
-    """
+    """Read a JSON file as `model`. Raises InputError, which names the file and the key, if it is missing, is not JSON,
+    or does not fit the model."""
     return check_content(path, load_json(path), model)
 
 
 def load_json(path: Path, *, most: int | None = None) -> Any:
-    """Content of a JSON file, unchecked.
-
-    Raises:
-        InputError: the file is missing, has more than `most` bytes, or is not JSON.
-    """
+    """Content of a JSON file, unchecked. Raises InputError if it is missing, exceeds `most` bytes, or is no JSON."""
     try:
         if most is not None and path.stat().st_size > most:
             raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {most}")
@@ -56,11 +49,7 @@ def load_json(path: Path, *, most: int | None = None) -> Any:
 
 
 def check_content(path: Path, content: Any, model: type[Model], *, expected: str = "") -> Model:
-    """Content of a file, as `model`.
-
-    Raises:
-        InputError: it does not fit; names the file, the key, and what was expected.
-    """
+    """Content of a file, as `model`. Raises InputError, with file, key and what was expected, if it does not fit."""
     try:
         return model.model_validate(content)
     except ValidationError as error:

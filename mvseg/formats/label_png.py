@@ -28,30 +28,19 @@ VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # definition: of that index
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
-    """(height, width) uint16 label map of a view.
-
-    Raises:
-        InputError: as `read_labels`, or another size than `width` x `height`.
-    """
+    """(height, width) uint16 label map of a view. Raises InputError as `read_labels`, or for another size."""
     return labels_of(open_labels(path, (width, height)), path)
 
 
 def read_labels(path: Path) -> np.ndarray:
-    """(H, W) uint16 label map of whatever size.
-
-    Raises:
-        InputError: the file is missing, cannot be decoded, is a JPEG, has colour channels, or does not hold
-            unsigned numbers of at most 16 bits.
-    """
+    """(H, W) uint16 label map of whatever size. Raises InputError if the file is missing, cannot be decoded, is a JPEG,
+    has colour channels, or does not hold unsigned numbers of at most 16 bits."""
     return labels_of(open_labels(path), path)
 
 
 def open_labels(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
-    """The decoded image of a label file; one of another size (width, height) than its camera states is not decoded.
-
-    Raises:
-        InputError: it is missing, cannot be decoded, is a JPEG, or is of another size.
-    """
+    """The decoded image of a label file. Raises InputError if it is missing, cannot be decoded, is a JPEG, or has
+    another size (width, height) than its camera states."""
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
     try:
@@ -90,11 +79,7 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
 
 
 def _clear_background(labels: np.ndarray, where: object = "") -> bool:
-    """Whether 255 is around all masks of a label map (H, W) uint16, and no mask's number: it becomes 0 in place.
-
-    Raises:
-        InputError: then 0 is a mask's number, and would be lost.
-    """
+    """Set 255 to 0 in place where it is around all masks of a label map (H, W) uint16 and none itself; True if so."""
     sides = np.concatenate((labels[0], labels[-1], labels[1:-1, 0], labels[1:-1, -1]))
     background = labels == VOC_BORDER
     if 2 * np.count_nonzero(sides == VOC_BORDER) <= len(sides):
@@ -110,14 +95,9 @@ def _clear_background(labels: np.ndarray, where: object = "") -> bool:
 
 
 def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
-    """(height, width) uint16: 0 = nothing, 65535 = ignore, any other number = one mask of this photo.
-
-    Colours are numbered in the order red, green, blue; grey colours keep their value.
-
-    Raises:
-        InputError: the file cannot be decoded, is a JPEG, has several pages, another size, numbers that are no labels,
-            or too many colours.
-    """
+    """(height, width) uint16: 0 = nothing, 65535 = ignore, any other number = one mask of this photo. Colours are
+    numbered in the order red, green, blue; grey colours keep their value. Raises InputError if the file cannot be
+    decoded, is a JPEG, has several pages, another size, numbers that are no labels, or too many colours."""
     image = open_labels(path, (width, height))
     try:
         num_pages = getattr(image, "n_frames", 1)
@@ -160,11 +140,8 @@ def ignore_border(labels: np.ndarray) -> bool:
 
 
 def labels_of_numbers(path: Path, numbers: np.ndarray) -> np.ndarray:
-    """uint16 labels from an array of any number type, renumbered from 1 if its numbers go beyond 16 bits.
-
-    Raises:
-        InputError: negative numbers, fractions, or more different numbers than 16 bits hold.
-    """
+    """uint16 labels from an array of any number type, renumbered from 1 if its numbers go beyond 16 bits. Raises
+    InputError for negative numbers, fractions, or more different numbers than 16 bits hold."""
     if not np.issubdtype(numbers.dtype, np.number) or np.issubdtype(numbers.dtype, np.complexfloating):
         raise InputError(f"{path}: holds {numbers.dtype}, expected whole numbers")
     if not np.isfinite(numbers).all() or (numbers < 0).any() or (numbers != np.floor(numbers)).any():
@@ -200,13 +177,9 @@ def _number_colours(path: Path, image: Image.Image, deep: np.ndarray | None) -> 
 
 
 def read_mask_images(paths: Sequence[Path], width: int, height: int) -> list[FoundMask]:
-    """The masks of one photo, an image each (of SAM's own script, BOP and many segmenters): whatever is not black.
-
-    They are numbered from 1 in the order of the paths, and may overlap.
-
-    Raises:
-        InputError: a file cannot be decoded, is a JPEG, or has another size.
-    """
+    """The masks of one photo, an image each (of SAM's own script, BOP and many segmenters): pixels that are not black.
+    They are numbered from 1 in the order of the paths, and may overlap. Raises InputError if a file cannot be decoded,
+    is a JPEG, or has another size."""
     masks = []
     for number, path in enumerate(paths, start=1):
         image = open_labels(path, (width, height))

@@ -27,11 +27,7 @@ def opencv_lens(
     K: np.ndarray, distortion: Sequence[float], *, width: int, height: int, is_fisheye: bool = False
 ) -> pycolmap.Camera | None:
     """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV, or k1 to k4 as its OPENCV_FISHEYE; K in
-    this project's pixels. None for a pinhole.
-
-    Raises:
-        InputError: K has skew together with distortion.
-    """
+    this project's pixels. None for a pinhole. Raises InputError if K has skew together with distortion."""
     if not is_fisheye and not any(distortion):
         return None
     if K[0, 1] != 0:
@@ -94,8 +90,7 @@ def _look_up(image: np.ndarray, lens: pycolmap.Camera, K: np.ndarray, *, mapping
 def _positions(
     *, model: str, params: tuple[float, ...], K: tuple[float, ...], size: tuple[int, int], mapping: Mapping
 ) -> np.ndarray:
-    """(2, H, W) float32: the column and row at which to look up each pixel, counted from pixel centres as cv2.remap
-    does; far outside the image for what it does not show."""
+    """(2, H, W) float32 column and row to look up for each pixel, as cv2.remap counts; far outside for nothing."""
     width, height = size
     lens = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     matrix = np.array(K).reshape(3, 3)

@@ -1,11 +1,10 @@
-"""Where the edges of a printed marker are, whatever a photo does to light.
+"""Edges of a printed marker, whatever a photo does to light.
 
-Blur mixes light, and a camera's tone curve bends it: the edge is not where values are halfway between those of black
-and white, but a bit outside of the black, or inside with another curve, and the sides of markers come out some per cent
-too short or too long. Inside a marker, white follows black and black follows white: both kinds of edges are off by the
-same shift in opposite directions. So the grid of modules and the shift are fitted together, and then the black square
-to its own edges, the shift taken off: modules may be irregular (those of images are whole pixels), the square has a
-known side.
+Blur mixes light, and a camera's tone curve bends it: the edge is not halfway between the values of black and white, but
+a bit outside of the black, or inside with another curve, and sides of markers come out some per cent too short or too
+long. Inside a marker, white follows black and black follows white: both kinds of edges are off by the same shift in
+opposite directions. So the grid of modules and the shift are fitted together, and then the black square to its own
+edges, the shift taken off: modules may be irregular (those of images are whole pixels), the square has a known side.
 """
 
 from __future__ import annotations
@@ -23,16 +22,13 @@ ACROSS = np.linspace(-0.5, 0.5, 25)  # in modules, from the middle of one to tha
 
 
 def fit_grid(photo: NDArray[np.uint8], quad: Floats, is_white: NDArray[np.bool_]) -> Floats:
-    """The corners of a marker, from all edges between its black and white modules.
+    """The corners of a marker, (4, 2) pixels, from all edges between its black and white modules.
 
     Args:
         photo: (H, W), values of any tone curve.
         quad: (4, 2) pixels, right to a quarter of a module, clockwise from its top left; the centre of the photo's
             first pixel is (0.5, 0.5).
         is_white: (M, M) its modules, with the black border.
-
-    Returns:
-        (4, 2) pixels.
     """
     square = len(is_white) * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     for _ in range(PASSES):
@@ -52,13 +48,7 @@ def fit_grid(photo: NDArray[np.uint8], quad: Floats, is_white: NDArray[np.bool_]
 def _find_edges(
     photo: NDArray[np.uint8], px_from_grid: Floats, is_white: NDArray[np.bool_], axis: int
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """E edges across one axis of the grid; `is_white` has this axis as its columns.
-
-    Returns:
-        (E, 9) how the place of each depends on the numbers of the fit: eight of a homography near the identity, of
-        which the last two act on both axes, and the shift; (E,) places, in modules from where the grid has them; and
-        which are of the square.
-    """
+    """E edges across one axis of the grid: (E, 9) derivatives by homography and shift, places, and if of the square."""
     outside = np.pad(is_white, ((0, 0), (1, 1)), constant_values=True).astype(int)
     steps = np.diff(outside, axis=1)  # 1 where white follows black, -1 where black follows white
     row, line = np.nonzero(steps)

@@ -21,12 +21,8 @@ Seen = dict[Corner, list[tuple[int, Floats]]]  # {corner: (view, (2,) pixels) wh
 
 
 def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
-    """Markers of a family in one photo (H, W) uint8 without lens distortion.
-
-    Returns:
-        {number of the marker: (4, 2) corners in pixels, clockwise from its top left, see `fit_grid`}; a marker that
-        appears twice is ambiguous and left out.
-    """
+    """Markers of a family in one photo (H, W) uint8 without lens distortion: {number of the marker: (4, 2) corners in
+    pixels, clockwise from its top left, see `fit_grid`}. A marker that appears twice is ambiguous and left out."""
     dictionary = marker_dictionary(family)
     quads, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)
     numbers, markers = [] if ids is None else [int(number) for number in ids.ravel()], {}
@@ -38,11 +34,7 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
 
 
 def find_scene_markers(photos: Photos) -> dict[Family, Seen]:
-    """Corners of the markers in all photos of a scene, by family.
-
-    Raises:
-        InputError: a photo is missing or broken.
-    """
+    """Corners of the markers in all photos of a scene, by family. Raises InputError if one is missing or broken."""
     markers: dict[Family, Seen] = {family: {} for family in FAMILIES}
     for view in progress_bar(range(len(photos.scene.views)), name="markers", unit="photo"):
         photo = read_grey(photos, view)
@@ -59,11 +51,8 @@ def read_grey(photos: Photos, view: int) -> Grey:
 
 
 def find_board(photo: Grey, board: BoardConfig) -> tuple[NDArray[np.int64], Floats]:
-    """Inner corners of a ChArUco board in one photo, with lens distortion or without.
-
-    Returns:
-        (P,) numbers of the corners, as in `BoardConfig.corners`, and their (P, 2) pixels; P is 0 where none is seen.
-    """
+    """Inner corners of a ChArUco board in one photo, with lens distortion or without: (P,) numbers, as in
+    `BoardConfig.corners`, and (P, 2) pixels; P is 0 where no corner is seen."""
     found, numbers, *_ = cv2.aruco.CharucoDetector(board.opencv()).detectBoard(photo)
     if numbers is None or found is None or not len(numbers):
         return np.zeros(0, np.int64), np.zeros((0, 2))

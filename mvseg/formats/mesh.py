@@ -34,10 +34,8 @@ def simplify_mesh(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *, instance_id: int) -> None:
-    """Write one mesh as binary PLY with normals, in world coordinates.
-
-    Every vertex has the RGB colour (0 to 255), and the id as its property `instance_id`.
-    """
+    """Write one mesh as binary PLY with normals, in world coordinates; every vertex has the RGB colour (0 to 255), and
+    the id as its property `instance_id`."""
     vertices = np.zeros(len(mesh.vertices), [(name, kind) for name, kind, _ in VERTEX])
     for names, columns in (("xyz", mesh.vertices), (("nx", "ny", "nz"), mesh.vertex_normals)):
         for name, column in zip(names, columns.T, strict=True):
@@ -67,7 +65,6 @@ def write_glb(
     and a double-sided material of its own: a leaf may be an open surface.
 
     Args:
-        meshes: {name: mesh}.
         colors: {name: RGB, 0 to 255}, sRGB; the file has them linear, as glTF requires.
         matrix: (4, 4) gltf_from_world; glTF is in metres, +y is up. None: the identity.
         about: the `extras` of that node.
@@ -97,8 +94,7 @@ def write_glb(
 
 
 def _unit_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(P, 3) normals of the vertices; those of a place without any (two sides that touch) point along +z, since glTF
-    allows unit vectors only."""
+    """(P, 3) normals of the vertices; +z where two sides touch and there is none: glTF allows unit vectors only."""
     normals = np.array(mesh.vertex_normals)
     has_none = np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-3
     normals[has_none] = (0, 0, 1)

@@ -39,8 +39,7 @@ class Calibration:
         K: (3, 3) float64, in this project's pixels (the centre of the top-left one is (0.5, 0.5)).
         distortion: OpenCV's coefficients; k1 to k4 of a fisheye.
         is_fisheye: whether they are of `cv::fisheye`.
-        width: pixels; None where the file does not say.
-        height: pixels; None where the file does not say.
+        width, height: pixels; None where the file does not say.
     """
 
     K: np.ndarray
@@ -50,11 +49,7 @@ class Calibration:
     height: int | None
 
     def lens(self, width: int, height: int) -> pycolmap.Camera | None:
-        """The lens, of photos of this size; None for a pinhole.
-
-        Raises:
-            InputError: K has skew together with distortion.
-        """
+        """The lens of photos of this size; None for a pinhole. Raises InputError for skew with distortion."""
         return opencv_lens(self.K, self.distortion, width=width, height=height, is_fisheye=self.is_fisheye)
 
 
@@ -75,12 +70,8 @@ _Loader.add_multi_constructor(
 
 
 def read_calibration(folder: Path, file: str) -> Calibration:
-    """Read a calibration file; its path is relative to the scene's folder.
-
-    Raises:
-        InputError: the file leads out of the scene, cannot be read, or holds no camera matrix, or a distortion that is
-            not supported. The message names the file.
-    """
+    """Read a calibration file; its path is relative to the scene's folder. Raises InputError, which names the file, if
+    it leads out of the scene, cannot be read, or holds no camera matrix, or a distortion that is not supported."""
     problem = file_name_problem(file)
     if problem:
         raise InputError(f"{file}: {problem}")

@@ -1,4 +1,4 @@
-"""What a photo shows, in a few numbers: is there anything, is it too dark or too bright, does it have colours?"""
+"""Content of a photo in a few numbers: is it blank, too dark or too bright, and does it have colours?"""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ class PhotoContent:
         contrast: standard deviation of its grey levels.
         level: grey level that 99 % of the pixels stay below.
         burnt: share of its pixels that are white.
-        grey: it has no colours.
     """
 
     contrast: float

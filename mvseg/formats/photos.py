@@ -41,11 +41,9 @@ class Photo:
 
     Attributes:
         file: path of the photo relative to the scene folder, "/" between folders.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         K: (3, 3) float64, without the distortion.
-        R: (3, 3) float64, of cam_from_world.
-        t: (3,) float64, of cam_from_world.
+        R, t: (3, 3) and (3,) float64, of cam_from_world.
         lens: the camera with its distortion, None for a pinhole.
     """
 
@@ -61,12 +59,8 @@ class Photo:
 def build_scene(
     folder: Path, photos: Sequence[Photo], *, unit: str, source: Path, up: tuple[float, float, float] | None = None
 ) -> Scene:
-    """The scene of a folder from its photos.
-
-    Args:
-        unit: of the world, "" when unknown.
-        source: the file or folder that the cameras come from; messages name it.
-        up: the direction of the world that points up, None when unknown.
+    """Build the scene of a folder from its photos; messages name `source`, the file or folder that the cameras come
+    from. `unit` is "" and `up`, the direction of the world that points up, None when unknown.
 
     Raises:
         InputError: fewer than two views, two views with the same name, a file name that leads out of the folder, a
@@ -103,15 +97,12 @@ def scene_name(folder: Path) -> str:
 
 
 def find_photo(folder: Path, file: str) -> str:
-    """The photo that a camera file refers to, as a path relative to the scene folder.
+    """Find the photo that a camera file refers to: its path relative to the scene folder; `file` itself, if none.
 
     It is the file of this path; or the one there whose name differs in case only, or has a suffix where the given name
     has none (nerfstudio, Blender); or, for a path of another machine or one that leads out of the scene folder (those
     of colmap2nerf start at its working directory), the only photo of this name in the scene folder or below its
     `images/`.
-
-    Returns:
-        The path; `file` itself, if there is no such photo.
     """
     name = file.replace("\\", "/").rsplit("/", 1)[-1].lower()
     if not file_name_problem(file):
@@ -127,11 +118,8 @@ def find_photo(folder: Path, file: str) -> str:
 
 
 def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
-    """Width and height of the photo that a camera file refers to, if the file does not state them.
-
-    Raises:
-        InputError: the photo is missing, too, or cannot be read. The message is a reason, without the photo's name.
-    """
+    """Width and height of the photo that a camera file refers to, if the file does not state them. Raises InputError,
+    with a reason that does not name the photo, if that is missing, too, or cannot be read."""
     photo = folder / find_photo(folder, file)
     if file_name_problem(os.path.relpath(photo, folder)) or not photo.is_file():
         raise InputError("width and height are missing, and so is the photo")
@@ -170,14 +158,12 @@ def _problem(photo: Photo, file: str) -> str | None:
 
 
 def check_photos(scene: Scene) -> None:
-    """Check that the photos of a scene exist. All may be missing: masks are enough for matching and for shapes.
+    """Check that the photos of a scene exist. All may be missing: masks are enough for matching and for shapes. Raises
+    InputError if some are there and others are missing.
 
     Warns (InputWarning) of photos that EXIF asks viewers to turn: cameras and masks must refer to the stored pixels, as
     those of COLMAP do; of 16-bit photos that all use fewer bits; and of other files in their folder, if all photos are
     missing.
-
-    Raises:
-        InputError: some photos are there and others are missing.
     """
     paths = [view.path for view in scene.views]
     present = [path.is_file() for path in paths]
@@ -252,16 +238,11 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
 class Photos:
     """The photos of a scene: `photos(view)` is (H, W, 3) uint8 RGB with its lens distortion removed, see `read_photo`.
 
-    One object goes through all stages of a run, and whoever asks for a photo asks it. `CACHED_BYTES` of photos are kept
-    in all, so that a scene that fits is decoded once. Of a larger one those that came first are kept, since every
-    stage goes through the photos in one order; each of the others is decoded once per stage. Content and hash of every
-    photo are kept, however large the scene is. (A photo of 16 bits is decoded once more, see `photo_bits`.)
-
-    What is returned is shared: it must not be written to.
-
-    Attributes:
-        scene: whose photos these are.
-        exist: whether there are photos; all of them or none, see `check_photos`.
+    One object goes through all stages of a run. `CACHED_BYTES` of photos are kept in all, so that a scene that fits is
+    decoded once. Of a larger one those that came first are kept, since every stage goes through the photos in one
+    order; each of the others is decoded once per stage. Content and hash of every photo are kept, however large the
+    scene is. (A photo of 16 bits is decoded once more, see `photo_bits`.) Photos are shared: they must not be written
+    to. `exist` is true if there are photos; all of them or none, see `check_photos`.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -318,14 +299,10 @@ def _undistort(stored: np.ndarray, scene: Scene, view: int) -> np.ndarray:
 
 
 def read_stored(scene: Scene, view: int) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, the photo of a view as its lens saw it.
-
-    Rows and columns are those that the file stores, whatever EXIF says; see `check_photos`. Photos of 10, 12 or 14 bits
-    in files of 16 are brightened, all of a scene alike; see `photo_bits`.
-
-    Raises:
-        InputError: the photo is missing, cannot be read, or is of another size than its camera says.
-    """
+    """(H, W, 3) uint8 RGB, the photo of a view as its lens saw it, in the file's rows and columns, whatever EXIF says;
+    see `check_photos`. Photos of 10, 12 or 14 bits in files of 16 are brightened, all of a scene alike; see
+    `photo_bits`. Raises InputError if the photo is missing, cannot be read, or is of another size than its camera
+    says."""
     path, (width, height) = scene.views[view].path, scene.cameras.sizes[view].tolist()
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")

@@ -32,13 +32,7 @@ Rows = Sequence[Mapping[Any, Any]]
 
 @dataclass(frozen=True, eq=False)
 class Positions:
-    """Camera positions by photo.
-
-    Attributes:
-        names: of the photos, as in the file.
-        xyz: (P, 3) float64.
-        unit: as the file states it; "" if it states none.
-    """
+    """Camera positions: `names` of the photos, `xyz` (P, 3) float64, and the `unit` that the file states, or ""."""
 
     names: tuple[str, ...]
     xyz: np.ndarray
@@ -50,12 +44,8 @@ class _Positions(BaseModel):
 
 
 def read_positions(path: Path) -> Positions:
-    """Read the camera positions of photos.
-
-    Raises:
-        InputError: the file cannot be read, has no columns for photo, x, y and z, holds other things than numbers
-            there, names a photo twice or has columns in different units.
-    """
+    """Read the camera positions of photos. Raises InputError if the file cannot be read, has no columns for photo, x, y
+    and z, holds other things than numbers there, names a photo twice or has columns in different units."""
     rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else _read_table(path, "positions")
     if not rows:
         raise InputError(f"{path}: holds no positions, expected a line for each photo")
@@ -70,12 +60,8 @@ def read_positions(path: Path) -> Positions:
 
 
 def read_photo_angles(path: Path) -> dict[str, float]:
-    """{name of the photo, as in the file: degrees}.
-
-    Raises:
-        InputError: the file cannot be read, has no columns for photo and angle, holds other things than numbers there,
-            or names a photo twice.
-    """
+    """{name of the photo, as in the file: degrees}. Raises InputError if the file cannot be read, has no columns for
+    photo and angle, holds other things than numbers there, or names a photo twice."""
     rows = _read_table(path, "angles")
     keys = _columns(rows)
     if not {"photo", "angle"} <= keys.keys():

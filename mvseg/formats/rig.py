@@ -67,12 +67,9 @@ def is_rig(path: Path) -> bool:
 
 
 def read_rig(path: Path) -> Scene:
-    """The scene of a rig file; photos are looked for beside it. Warns (InputWarning) of unknown keys: a misspelt
-    "distortion" must not pass unseen.
-
-    Raises:
-        InputError: the file is missing, broken or of another format, or holds unsound cameras; see `build_scene`.
-    """
+    """Read the scene of a rig file; photos are looked for beside it. Warns (InputWarning) of unknown keys: a misspelt
+    "distortion" must not pass unseen. Raises InputError if the file is missing, broken or of another format, or holds
+    unsound cameras; see `build_scene`."""
     rig = read_json(path, _Rig)
     warn_of_unknown_keys(path, [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))])
     photos = []
@@ -91,11 +88,8 @@ def warn_of_unknown_keys(path: Path, entries: Iterable[tuple[str, BaseModel]]) -
 
 def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
     """A photo with its camera, complete: `folder` is the scene, where the photo and a calibration are looked for.
-
-    Raises:
-        InputError: there is not exactly one of K and a calibration, the calibration cannot be read or is of another
-            size, the size is not known, or the distortion is not a model of OpenCV. The message is a reason.
-    """
+    Raises InputError, with a reason, if there is not exactly one of K and a calibration, the calibration cannot be read
+    or is of another size, the size is not known, or the distortion is not a model of OpenCV."""
     calibration, given = _calibration(folder, camera), (camera.width, camera.height)
     width, height = calibration.width or camera.width, calibration.height or camera.height
     if width is None or height is None:
@@ -120,13 +114,8 @@ def _calibration(folder: Path, camera: RigCamera) -> Calibration:
 
 
 def write_rig(path: Path, scene: Scene, files: list[str]) -> None:
-    """Write a rig file.
-
-    Args:
-        path: where; its folder must exist.
-        scene: gives the cameras with their lenses (which must be OpenCV's), the unit and the direction that points up.
-        files: V photo paths relative to the folder of `path`.
-    """
+    """Write a rig file into a folder that exists: cameras, whose lenses must be OpenCV's, unit and up of `scene`;
+    `files` are V photo paths relative to that folder."""
     cameras, views = scene.cameras, []
     for index, file in enumerate(files):
         width, height = cameras.sizes[index].tolist()

@@ -24,23 +24,15 @@ class Rle(BaseModel):
 
 def decode_rle(counts: str | list[int], width: int, height: int) -> np.ndarray:
     """(height, width) bool from the counts of a COCO RLE, compressed or not: run lengths down the columns, 0 first.
-
-    pycocotools leaves uninitialised memory where the counts are too short; here that is an error.
-
-    Raises:
-        InputError: the counts do not add up to the image.
-    """
+    Raises InputError if they do not add up to the image, where pycocotools leaves uninitialised memory."""
     runs = _read_runs(counts, width, height)
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
 
 
 def decode_crop(counts: str | list[int], width: int, height: int) -> tuple[tuple[int, int, int, int], np.ndarray]:
     """The bounding box x1, y1, x2, y2 of the mask that `decode_rle` gives, half-open, and its pixels there, (y2 - y1,
-    x2 - x1) bool, without the rest of the image; of a mask without pixels one that is not set, (0, 0, 1, 1).
-
-    Raises:
-        InputError: the counts do not add up to the image.
-    """
+    x2 - x1) bool, without the rest of the image; of a mask without pixels one that is not set, (0, 0, 1, 1). Raises
+    InputError if the counts do not add up to the image."""
     runs = _read_runs(counts, width, height)
     ends = runs.cumsum()
     stops = ends[1::2]
@@ -81,8 +73,7 @@ def _read_runs(counts: str | list[int], width: int, height: int) -> NDArray[np.i
 
 
 def _decompress(counts: str) -> list[int]:
-    """Run lengths from COCO's string: 5 bits per character, lowest first, the sixth bit says that more follow; from the
-    fourth run on, the difference from the run before the last."""
+    """Run lengths from COCO's string: 5 bits per character, the sixth says more follow; from run 4 on, differences."""
     bits = np.frombuffer(counts.encode("utf-32-le", "surrogatepass"), "<u4").astype(np.int64) - 48
     last = np.flatnonzero(bits & 0x20 == 0)  # character of each number
     first = np.append(0, last[:-1] + 1)[: len(last)]

@@ -42,12 +42,11 @@ READERS: dict[str, Callable[[Path], Scene]] = {
 def load_scene(folder: Path | str) -> Scene:
     """Load the cameras of a scene folder; photos are read later, when they are needed, and may be absent.
 
-    Cameras come from the first that exists: `cameras.json` (rig file), a COLMAP model in `sparse/` or
-    `colmap/sparse/` (see `find_colmap_model`), `transforms.json` or `transforms_train.json` (nerfstudio, instant-ngp,
-    Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP). Another program's `cameras.json`
-    is left out where another of these is there, which an InputWarning says.
-
-    Names of photos may be composed or decomposed Unicode (macOS), whatever the files' are.
+    Cameras come from the first that exists: `cameras.json` (rig file), a COLMAP model in `sparse/` or `colmap/sparse/`
+    (see `find_colmap_model`), `transforms.json` or `transforms_train.json` (nerfstudio, instant-ngp, Blender),
+    `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP). Another program's `cameras.json` is left out
+    where another of these is there, which an InputWarning says. Names of photos may be composed or decomposed Unicode
+    (macOS), whatever the files' are.
 
     Raises:
         InputError: the folder is missing or holds no cameras, or they are not sound; see the readers.
@@ -105,10 +104,8 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
     """Load the masks of every view, with the lens distortion of the scene removed.
 
     Args:
-        scene: gives the views and their sizes.
         masks: a COCO JSON file, or a folder with files that are named after the photos: label images (PNG, TIFF), NumPy
-            files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see
-            `recognise_masks`.
+            files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see `recognise_masks`.
         crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`.
         categories: names of the categories that are taken, of COCO, labelme and YOLO files; all, if empty.
 

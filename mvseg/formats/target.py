@@ -32,12 +32,7 @@ SIGN = b"(mvseg target: AprilTags"  # by which the page is known
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A filled polygon.
-
-    Attributes:
-        name: as the tables have it.
-        outline: (P, 2) its corners, whole micrometres, as the file has them.
-    """
+    """A filled polygon, named as in the tables; `outline` are its (P, 2) corners, whole micrometres, as in the file."""
 
     name: str
     outline: Floats
@@ -79,11 +74,7 @@ def tag_distance() -> float:
 
 
 def write_target(path: Path) -> None:
-    """Write the page, whole or not at all; its folder is made.
-
-    Raises:
-        InputError: it would not be called .pdf.
-    """
+    """Write the page, whole or not at all; its folder is made. Raises InputError if it would not be called .pdf."""
     if path.suffix.lower() != ".pdf":
         raise InputError(f"{path}: expected a name that ends with .pdf")
     path.parent.mkdir(parents=True, exist_ok=True)

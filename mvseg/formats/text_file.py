@@ -1,5 +1,4 @@
-"""Text, CSV and YAML files that people write, read whole; each fault is one sentence. And the tables that mvseg
-writes."""
+"""Text, CSV and YAML files that people write, read whole, each fault one sentence; and the tables that mvseg writes."""
 
 from __future__ import annotations
 
@@ -25,11 +24,8 @@ Cell = str | float | None
 
 
 def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:
-    """The bytes of a file.
-
-    Raises:
-        InputError: it cannot be read, or has more than `most` bytes; names the path and what was expected.
-    """
+    """The bytes of a file. Raises InputError, which names the path and what was expected, if it cannot be read, or has
+    more than `most` bytes."""
     try:
         with path.open("rb") as file:
             data = file.read(most + 1)
@@ -41,11 +37,8 @@ def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:
 
 
 def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
-    """The text of a file, without the byte order mark that Windows editors write.
-
-    Raises:
-        InputError: as `read_bytes`, or it is not UTF-8.
-    """
+    """The text of a file, without the byte order mark that Windows editors write. Raises InputError as `read_bytes`, or
+    if it is not UTF-8."""
     return _decode(read_bytes(path, expected, most=most), path, expected)
 
 
@@ -58,13 +51,9 @@ def _decode(data: bytes, path: Path, expected: str) -> str:
 
 def read_table(path: Path, expected: str, *, most: int = MAX_TABLE) -> list[tuple[int, list[str]]]:
     """The rows of a CSV file that are not empty, the header first: number of the line, and cells without space around
-    them. Cells are separated by commas, semicolons or tabs, whichever the header has most of.
-
-    As Excel writes it, too: UTF-16, a first line "sep=;", and cells without content at the ends of all lines.
-
-    Raises:
-        InputError: as `read_text`, or it is not CSV.
-    """
+    them. Cells are separated by commas, semicolons or tabs, whichever the header has most of. Excel's forms are read,
+    too: UTF-16, a first line "sep=;", and cells without content at the ends of all lines. Raises InputError as
+    `read_text`, or if it is not CSV."""
     data = read_bytes(path, expected, most=most)
     is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:
@@ -86,10 +75,8 @@ def read_table(path: Path, expected: str, *, most: int = MAX_TABLE) -> list[tupl
 
 
 def write_table(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Cell]]) -> None:
-    """Write a CSV file in UTF-8 with a header, whole or not at all, that pandas and spreadsheets open.
-
-    Whole numbers as they are, other numbers by `format_number`, text by `escape_text`, None as "".
-    """
+    """Write a CSV file in UTF-8 with a header, whole or not at all, that pandas and spreadsheets open: whole numbers as
+    they are, other numbers by `format_number`, text by `escape_text`, None as ""."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([columns, *([_as_cell(value) for value in row] for row in rows)])
     write_text_whole(path, text.getvalue())
@@ -113,12 +100,9 @@ def escape_text(text: str) -> str:
 
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
-    """Content of a YAML file; a line of OpenCV, "%YAML:1.0", is left out.
-
-    Raises:
-        InputError: as `read_text`, or it is not YAML, is nested more than 32 deep, uses aliases (nested ones expand 300
-            bytes into billions of values), or holds a number of more than 400 digits.
-    """
+    """Content of a YAML file; a line of OpenCV, "%YAML:1.0", is left out. Raises InputError as `read_text`, or if it is
+    not YAML, is nested more than 32 deep, uses aliases (nested ones expand 300 bytes into billions of values), or holds
+    a number of more than 400 digits."""
     lines = read_text(path, expected).split("\n")
     text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
     try:

@@ -60,11 +60,7 @@ class _Intrinsics(BaseModel):
 
     @property
     def intrinsics(self) -> dict[str, Any]:
-        """Intrinsics that the file states.
-
-        Raises:
-            InputError: nerfstudio's list of coefficients has another length, or other ones are stated beside it.
-        """
+        """Intrinsics that the file states; InputError where nerfstudio's list of coefficients does not fit."""
         stated = self.model_dump(include={*_Intrinsics.model_fields} - {"distortion_params"}, exclude_none=True)
         if self.distortion_params is None:
             return stated
@@ -89,11 +85,9 @@ class _Transforms(_Intrinsics):
 
 
 def read_transforms(path: Path) -> Scene:
-    """The scene of a transforms.json; its unit is unknown (""). A frame's own intrinsics override those of the file.
-
-    Where the file has no size it is that of the photo; where it has no focal length, `camera_angle_x` (Blender) gives
-    it.
-    Warns (InputWarning) of masks that are not used.
+    """Read the scene of a transforms.json; its unit is unknown (""). A frame's own intrinsics override those of the
+    file. Where the file has no size it is that of the photo; where it has no focal length, `camera_angle_x` (Blender)
+    gives it. Warns (InputWarning) of masks that are not used.
 
     Raises:
         InputError: the file is missing or broken, an intrinsic is missing, the camera model is not known, the applied
@@ -138,8 +132,7 @@ def _merge(shared: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def _undo_applied(path: Path, transforms: _Transforms) -> tuple[np.ndarray, float]:
-    """(4, 4) rigid: from the world that `applied_scale` has not scaled yet to that before `applied_transform`; and the
-    scale. nerfstudio moves a point X to scale * (applied_transform X)."""
+    """(4, 4) rigid, to the world before `applied_transform`, and the scale: X became scale * (applied_transform X)."""
     applied = np.eye(4)
     if transforms.applied_transform is not None:
         applied[:3] = np.array(transforms.applied_transform)[:3]

@@ -56,12 +56,9 @@ class _Turntable(BaseModel):
 
 
 def read_turntable(path: Path) -> Scene:
-    """The scene of a turntable file; photos are looked for beside it. Warns (InputWarning) of unknown keys.
-
-    Raises:
-        InputError: the file is missing, broken or of another format, a view names no camera of the file, the axis has
-            no direction, or a camera is unsound; see `photo_of` and `build_scene`.
-    """
+    """Read the scene of a turntable file; photos are looked for beside it. Warns (InputWarning) of unknown keys. Raises
+    InputError if the file is missing, broken or of another format, a view names no camera of the file, the axis has no
+    direction, or a camera is unsound; see `photo_of` and `build_scene`."""
     table = _read_table(path)
     owners = [("the turntable", table), *((f"camera {name}", each) for name, each in table.cameras.items())]
     warn_of_unknown_keys(path, [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))])
@@ -86,13 +83,10 @@ def _read_table(path: Path) -> _Turntable:
 
 
 def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tuple[str, float]], str]:
-    """The cameras (as in a rig file) by name, the camera and the angle of each view in order, and the unit of a
-    turntable whose axis is the world's z axis: what `write_turntable` takes.
-
-    Raises:
-        InputError: the file cannot be read, has no camera or another axis, a view names no camera of it, or a camera
-            has no K and size, or a distortion of more than five numbers.
-    """
+    """Read what `write_turntable` takes, of a turntable whose axis is the world's z axis: the cameras (as in a rig
+    file) by name, the camera and the angle of each view in order, and the unit. Raises InputError if the file cannot be
+    read, has no camera or another axis, a view names no camera of it, or a camera has no K and size, or a distortion of
+    more than five numbers."""
     table = _read_table(path)
     axis = table.axis
     if not table.cameras or (*axis.point, *axis.direction) != (0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
@@ -110,13 +104,9 @@ def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tu
 def write_turntable(
     path: Path, cameras: Mapping[str, dict[str, Any]], views: Sequence[tuple[str, str, float]], *, unit: str
 ) -> None:
-    """Write the file of cameras beside a table whose axis is the world's z axis.
-
-    Args:
-        path: where; its folder must exist.
-        cameras: width, height, K, R, t and distortion, as in a rig file, by name.
-        views: file, camera and angle in degrees of each photo.
-    """
+    """Write the file of cameras beside a table whose axis is the world's z axis, into a folder that exists. `cameras`
+    hold width, height, K, R, t and distortion, as in a rig file, by name; `views` the file, camera and angle in degrees
+    of each photo."""
     content = {
         "format": TURNTABLE_FORMAT,
         "unit": unit,

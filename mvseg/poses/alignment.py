@@ -1,5 +1,4 @@
-"""Similarities: the scale, rotation and translation that structure from motion leaves undetermined, from points known
-in both frames.
+"""Scale, rotation and translation that structure from motion leaves undetermined, from points known in both frames.
 
 Closed form: Umeyama, Least-squares estimation of transformation parameters between two point patterns (PAMI 1991).
 `similarity * points` are (P, 3) points of the scene in the known world. pycolmap's own `estimate_sim3d` refuses
@@ -54,8 +53,7 @@ def spreads(points: Floats) -> Floats:
 
 
 def is_one_line(points: Floats) -> bool:
-    """Whether points are collinear (or coincide), so that the rotation about the line is undetermined; two always
-    are."""
+    """Whether points coincide or are collinear, as two always are: the rotation about the line is undetermined."""
     if len(points) < 3:
         return True
     along, across = spreads(points)[:2]
@@ -63,16 +61,9 @@ def is_one_line(points: Floats) -> bool:
 
 
 def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
-    """The similarity with the least squared distances between P mapped sources and their targets (Umeyama).
-
-    Args:
-        source: (P, 3), P >= 3, not on one line.
-        target: (P, 3), the same points in the other world, not on one line.
-
-    Raises:
-        InputError: fewer than three points, points on one line, or targets that are the mirror image of the sources
-            (left-handed axes), which cannot be detected for coplanar points.
-    """
+    """The similarity with the least squared distances between mapped sources (P, 3) and their targets (P, 3) (Umeyama).
+    Raises InputError for fewer than three points, points on one line, or targets that are the mirror image of the
+    sources (left-handed axes), which cannot be detected for coplanar points."""
     if len(source) < 3:
         raise InputError(f"{len(source)} known points, expected at least three that are not on one line")
     if is_one_line(source) or is_one_line(target):
@@ -92,25 +83,16 @@ def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
 
 
 def _refuse_mirror(source: Floats, target: Floats, residuals: list[float]) -> None:
-    """Raise InputError if the targets are fitted far better by the mirror image of the sources: `residuals` are of the
-    sources and of their image. In one plane both are as good, and small residuals differ by noise."""
+    """Raise InputError if mirrored sources fit far better; `residuals` are of both. In one plane both are as good."""
     is_flat = any(off <= WORLD.flat * across for _, across, off in (spreads(source), spreads(target)))
     if not is_flat and residuals[1] < WORLD.mirrored * residuals[0] and residuals[0] > WORLD.flat * spreads(target)[0]:
         raise InputError("the known points are mirrored, expected right-handed axes: reverse one axis")
 
 
 def align(source: Floats, target: Floats) -> SimilarityFit:
-    """A similarity that ignores the targets that contradict most others (least median of squares, then least squares).
-
-    Of P targets, (P - 4) / 2 rounded up may be wrong: none of three or four, one of five, 28 of 60. Deterministic.
-
-    Args:
-        source: (P, 3).
-        target: (P, 3).
-
-    Raises:
-        InputError: see `fit_similarity`.
-    """
+    """A similarity that ignores the targets (P, 3) that contradict most others (least median of squares, then least
+    squares). Of P targets, (P - 4) / 2 rounded up may be wrong: none of three or four, one of five, 28 of 60.
+    Deterministic. Raises InputError, see `fit_similarity`."""
     is_inlier = np.ones(len(source), bool)
     if len(source) < 5 or is_one_line(source) or is_one_line(target):
         best = fit_similarity(source, target)

@@ -45,10 +45,8 @@ class TurntableCalibration:
 def calibrate_turntable(
     photos: Mapping[str, Sequence[Grey]], board: BoardConfig, *, lens: TableCamera | None = None
 ) -> TurntableCalibration:
-    """Cameras, axis and angles from photos of a board that turns with the table.
-
-    Angle 0 is the first at which a camera sees the board. The world's origin is on the axis, at the height of the
-    middle of the board.
+    """Cameras, axis and angles from photos of a board that turns with the table. Angle 0 is the first at which a camera
+    sees the board. The world's origin is on the axis, at the height of the middle of the board.
 
     Args:
         photos: A photos of each camera, at the same angles in the same order: (H, W) uint8, of one size for each
@@ -128,8 +126,7 @@ def _fit(
     fix_lenses: bool,
     tolerance: float,
 ) -> tuple[list[int], TableFit]:
-    """The table as these cameras see it, from lenses that are nearly right: places of the angles at which the board is
-    seen, and what explains it best; its cameras are in the order of `sightings`."""
+    """Places of the angles at which the board is seen, and the fit that explains it best; `lenses` are nearly right."""
     poses = {name: {angle: _board_pose(*each, board, lenses[name]) for angle, each in corners_of.items()}
              for name, corners_of in sightings.items()}  # fmt: skip
     numbers = [each for photos in sightings.values() for each, _ in photos.values()]
@@ -162,11 +159,7 @@ def _board_pose(numbers: np.ndarray, px: Floats, board: BoardConfig, lens: Table
 def _initialise(
     lenses: Mapping[str, TableCamera], poses: Mapping[str, Poses], *, middle: Floats
 ) -> tuple[dict[str, TableCamera], dict[int, float], pycolmap.Rigid3d]:
-    """Cameras in one world, {place of the angle: degrees} and world_from_board, from the poses of the boards alone.
-
-    The camera that sees the board most often gives axis and world; each of the others joins through an angle that is
-    known by then.
-    """
+    """Cameras in one world, {place of the angle: degrees} and world_from_board, from the poses of the boards alone."""
     first = max(poses, key=lambda name: len(poses[name]))
     cam_from_world, angles, world_from_board = _initial_world(poses[first], middle)
     placed = {first: cam_from_world}
@@ -189,11 +182,7 @@ def _initialise(
 
 
 def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict[int, float], pycolmap.Rigid3d]:
-    """The table as one camera sees it: z along the axis, the board's middle (3,) at height 0, angle 0 at first.
-
-    Returns:
-        cam_from_world, the angles in degrees, and world_from_board.
-    """
+    """cam_from_world, angles (degrees, 0 first) and world_from_board; z is the axis, 0 at the board's middle (3,)."""
     direction, point, turns = _find_axis(list(poses.values()))
     if np.ptp(turns) < TABLE.least_turn:
         raise InputError(f"the board turned by {np.ptp(turns):.1f} degrees in all, expected a table that turns")
@@ -210,11 +199,7 @@ def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict
 
 
 def _find_axis(poses: Sequence[pycolmap.Rigid3d]) -> tuple[Floats, Floats, Floats]:
-    """The axis about which the board turns, from its A poses in the frame of a camera.
-
-    Returns:
-        Its direction (3,) and a point on it (3,), and the angles (A,) in degrees from the first pose.
-    """
+    """Direction (3,) and point (3,) of the axis, and angles (A,) in degrees from the first of A poses of the board."""
     motions = [pose * poses[0].inverse() for pose in poses]
     vectors = np.array([_rotation(motion).as_rotvec() for motion in motions])
     direction = np.linalg.svd(vectors)[2][0]

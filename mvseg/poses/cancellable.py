@@ -13,13 +13,9 @@ Answer = TypeVar("Answer")
 
 
 def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> Answer:
-    """Run a function of pycolmap; it gets a `cancellation_token` and returns soon after that was cancelled.
-
-    Python handles signals between bytecodes only, and such a call takes seconds to minutes.
-
-    Raises:
-        BaseException: what the call raises; or what a signal raises meanwhile, once the call has returned.
-    """
+    """Run a function of pycolmap; it gets a `cancellation_token` and returns soon after that was cancelled. Python
+    handles signals between bytecodes only, and such a call takes seconds to minutes. Raises what the call raises; or
+    what a signal raises meanwhile, once the call has returned."""
     token, done, answers, errors = pycolmap.CancellationToken(), Event(), [], []
 
     def run() -> None:

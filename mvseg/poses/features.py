@@ -1,9 +1,8 @@
 """SIFT features of every photo and their matches, in COLMAP's database.
 
 `find_features` is quick. `extract_features` finds more, COLMAP's own, in four times the time, and matching those takes
-nearly ten times as long: for photos of which too few register otherwise.
-
-COLMAP's lists of pairs cannot hold names with spaces, so it gets the photos under numbers.
+nearly ten times as long: for photos of which too few register otherwise. COLMAP's lists of pairs cannot hold names with
+spaces, so it gets the photos under numbers.
 """
 
 from __future__ import annotations
@@ -49,12 +48,9 @@ def make_database(
     config: PoseConfig,
     lens: pycolmap.Camera | None = None,
 ) -> None:
-    """A new database with all photos, of these names in `folder`; those of one camera share it. `lens` is the camera,
-    if it is calibrated.
-
-    Raises:
-        InputError: COLMAP cannot read a photo, or photos of different sizes are to share a camera.
-    """
+    """Make a new database with all photos, of these names in `folder`; those of one camera share it. `lens` is the
+    camera, if it is calibrated. Raises InputError if COLMAP cannot read a photo, or photos of one camera differ in
+    size."""
     pycolmap.Database.open(database).close()  # makes it
     for names in _names_by_camera(numbered, config):  # in order, so that photos have the same numbers in every run
         pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, names, _reader(config, lens))
@@ -65,11 +61,8 @@ def make_database(
 
 
 def find_features(database: Path, folder: Path, names: Sequence[str], *, image_size: int) -> NDArray[np.int64]:
-    """Find `STRUCTURE.quick_most` features or fewer in each photo of the database, at `quick_size` pixels or fewer.
-
-    Returns:
-        (V, V) how alike the photos are, see `count_alike`.
-    """
+    """Find `STRUCTURE.quick_most` features or fewer in each photo of the database, at `quick_size` pixels or fewer;
+    returns (V, V) how alike the photos are, see `count_alike`."""
     coarse, size = [], min(image_size, STRUCTURE.quick_size)
     with pycolmap.Database.open(database) as opened:
         number_of = {image.name: image.image_id for image in opened.read_all_images()}
@@ -123,8 +116,7 @@ def _names_by_camera(numbered: Mapping[str, PhotoFile], config: PoseConfig) -> l
 
 
 def match_features(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> None:
-    """Match the features of pairs (i, j) of photos in the database, which have these names, and keep what fits one
-    relative pose."""
+    """Match the features of pairs (i, j) of these photos in the database, and keep what fits one relative pose."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = STRUCTURE.seed

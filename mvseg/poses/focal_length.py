@@ -39,12 +39,9 @@ def least_sure(lengths: Sequence[FocalLength]) -> FocalLength:
 
 
 def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[FocalLength]:
-    """The focal length (the first of two) of each camera of a model, in order of their numbers.
-
-    A deviation is that of the bundle adjustment, which has the principal point in the middle, and what moving that by
-    `TABLE.off_middle` changes: nearly all of it for flat scenes and photos from one height. 100 % where nothing is
-    determined.
-    """
+    """The focal length (the first of two) of each camera of a model, in order of their numbers. A deviation is that of
+    the bundle adjustment, which has the principal point in the middle, and what moving that by `TABLE.off_middle`
+    changes: nearly all of it for flat scenes and photos from one height. 100 % where nothing is determined."""
     covariance = None if is_given else _covariance(model)
     noise, lengths = noise_px(model), []
     for _, camera in sorted(model.cameras.items()):
@@ -60,8 +57,7 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
 
 
 def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: int) -> float:
-    """Pixels, standard deviation of the focal length that an adjustment with a fixed principal point finds;
-    `covariance` is that of all numbers of the camera, with a free one."""
+    """Deviation of the focal length for a fixed principal point, pixels; `covariance` is that with a free one."""
     principal = camera.principal_point_idxs()
     gain = np.linalg.solve(covariance[np.ix_(principal, principal)], covariance[principal, focal])
     variance = covariance[focal, focal] - gain @ covariance[principal, focal]

@@ -38,7 +38,6 @@ class Placement:
 
     Attributes:
         similarity: world_from_scene.
-        unit: name of the unit of the world.
         source: where the scale comes from, as text; "" if nowhere.
         residual: root mean square residual, in units of the world; None if unknown.
         left_out: names of photos whose positions contradict the others.
@@ -62,15 +61,9 @@ class Placement:
 
 
 def place(scene: Scene, world: WorldFacts) -> Placement:
-    """The similarity that transforms a scene into the known world.
-
-    Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
-
-    Without a length the scene stays as it is.
-
-    Raises:
-        InputError: the markers or photos named are not seen, the positions do not fit the photos or are mirrored.
-    """
+    """The similarity that transforms a scene into the known world; without a length the scene stays as it is. Warns
+    (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line. Raises
+    InputError if the markers or photos named are not seen, or the positions do not fit the photos or are mirrored."""
     if world.board is not None:
         return _by_board(scene, world.board, world.unit)
     if world.marker is not None:
@@ -218,11 +211,7 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
 
 
 def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit: str) -> Placement:
-    """The scale alone: the median ratio of distances, those of far pairs counting.
-
-    Raises:
-        InputError: the cameras do not stand on one line, or all positions are at one place.
-    """
+    """The scale alone: the median ratio of distances, those of far pairs counting."""
     if len(centers) > 2 and np.ptp(target, axis=0).any() and not is_one_line(centers):
         ranges = np.ptp(target, axis=0)
         still = [axis for axis, range_ in zip("xyz", ranges, strict=True) if range_ <= WORLD.flat * ranges.max()]

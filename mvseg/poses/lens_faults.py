@@ -29,8 +29,7 @@ class LensReport:
     Attributes:
         finding: the fault; None: the lens explains the photos, or nothing explains them better.
         model: the photos and points with the lens that is to stay.
-        is_square_known: whether the photos show that pixels are square, or how they are not; else they are assumed to
-            be square: walks at one height do not show it.
+        is_square_known: whether photos show the shape of pixels, as walks at one height do not; else assumed square.
     """
 
     finding: Finding | None
@@ -48,11 +47,9 @@ class _Trial:
 
 
 def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
-    """The fault of the shared lens of a model that explains its photos best.
-
-    Photos that are squashed keep two focal lengths: nothing is lost then. The others need what their sentence says.
-    Nothing is asked of models that are not COLMAP's SIMPLE_RADIAL, or in which each photo has its own lens.
-    """
+    """The fault of the shared lens of a model that explains its photos best. Photos that are squashed keep two focal
+    lengths: nothing is lost then. The others need what their sentence says. Nothing is asked of models that are not
+    COLMAP's SIMPLE_RADIAL, or in which each photo has its own lens."""
     names = {camera.model_name for camera in model.cameras.values()}
     if names != {"SIMPLE_RADIAL"} or len(model.cameras) == model.num_reg_images():
         return LensReport(None, model)
@@ -140,8 +137,7 @@ def _focal_lengths_of_photos(
 
 
 def _aspect(two: _Trial) -> tuple[float, float]:
-    """Width of a pixel in heights, and its standard deviation, of the camera where it is least certain; (1, infinite)
-    where it is not determined."""
+    """Width of a pixel in heights, and its deviation, of the least certain camera; (1, infinite) if not determined."""
     known = pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), two.model, two.adjusting)
     worst = 1.0, 0.0
     for camera in two.model.cameras.values():

@@ -35,8 +35,7 @@ class Structure:
 
     Attributes:
         model: COLMAP's reconstruction of the registered photos; images have the names of the photos.
-        registered: names of the photos with a pose, in the order of all photos.
-        left_out: names of the others.
+        registered: names of the photos with a pose, in the order of all photos; `left_out` are the others.
         plain: names of the photos with so few features that nothing could register them.
         other_models: number of further photos in each of the other models, which have frames of their own.
     """
@@ -61,10 +60,9 @@ def find_structure(
     calibration: Calibration | None = None,
     work: Path | None = None,
 ) -> Structure:
-    """Estimate the cameras of photos, and 3D points, from the photos alone.
-
-    Equal photos give equal cameras, bit by bit, on one machine and with one version of pycolmap: random draws have
-    fixed seeds, and the mapping runs on one thread. Other processors round differently.
+    """Estimate the cameras of photos, and 3D points, from the photos alone. Equal photos give equal cameras, bit by
+    bit, on one machine and with one version of pycolmap: random draws have fixed seeds, and the mapping runs on one
+    thread. Other processors round differently.
 
     Args:
         photos: in the order in which they were taken.
@@ -117,10 +115,7 @@ class _Task:
 
 
 def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair], tuple[str, ...]]:
-    """Models from few features of chosen pairs, the largest first; the pairs; and photos with hardly any texture.
-
-    Photos that this leaves out are compared with all others, unless the pairs were asked for.
-    """
+    """Models from few features of chosen pairs, the largest first; the pairs; and photos with hardly any texture."""
     database, names, images = task.work / "quick.db", list(task.photo_of), task.work / PHOTOS
     make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
     alike = find_features(database, images, names, image_size=task.config.image_size)
@@ -156,8 +151,7 @@ def _is_whole(models: Sequence[pycolmap.Reconstruction], task: _Task) -> bool:
 
 
 def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.IncrementalPipelineOptions:
-    """COLMAP's own, on one thread. With `few_matches` a photo needs less to register: plants that fill photos taken 30
-    degrees apart share few features."""
+    """COLMAP's own, on one thread; `few_matches`, for plants in photos 30 degrees apart, asks less of a photo."""
     least, seed = STRUCTURE.least, STRUCTURE.seed
     options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=least)
     mapper = options.mapper

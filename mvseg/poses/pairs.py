@@ -1,4 +1,4 @@
-"""Which photos are compared: neighbours in the order in which they were taken, a few further away, and those alike."""
+"""Pairs of photos to compare: neighbours in the order in which they were taken, a few further away, and those alike."""
 
 from __future__ import annotations
 

@@ -39,8 +39,7 @@ class PhotoFile:
 
     Attributes:
         name: path below `images/`, "/" between folders.
-        width: pixels.
-        height: pixels.
+        width, height: pixels.
         optics: what EXIF says of camera model and focal length; "" where it says nothing.
         is_turned: it was turned upright, as EXIF asks.
         zoom: digital zoom; 1 where EXIF says nothing.
@@ -63,11 +62,8 @@ class PhotoFile:
 
 
 def calibrated_size(calibration: Calibration, photos: Sequence[PhotoFile]) -> tuple[int, int]:
-    """Width and height of photos that were all taken with a calibrated camera.
-
-    Raises:
-        InputError: a photo has another size than the calibration, or than the first photo if that says none.
-    """
+    """Width and height of photos that were all taken with a calibrated camera. Raises InputError if a photo has another
+    size than the calibration, or than the first photo if that says none."""
     size = (calibration.width or photos[0].width, calibration.height or photos[0].height)
     other = next((photo for photo in photos if photo.size != size), None)
     if other is not None:
@@ -78,15 +74,9 @@ def calibrated_size(calibration: Calibration, photos: Sequence[PhotoFile]) -> tu
 
 def list_photos(folder: Path) -> tuple[Path, list[str]]:
     """List the photos of a folder: the files in it; without any, those in its `images/`; without these, those in its
-    sub-folders, one for each camera.
-
-    Returns:
-        The folder (or its `images/`), and the paths of the photos relative to it, in natural order.
-
-    Raises:
-        InputError: there is no such folder, it holds fewer than three photos, or two photos differ in their suffix
-            only.
-    """
+    sub-folders, one for each camera. Returns the folder (or its `images/`), and the paths of the photos relative to it,
+    in natural order. Raises InputError if there is no such folder, it holds fewer than three photos, or two photos
+    differ in their suffix only."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {problem}, expected a folder of photos or a video (MP4, MOV, 3GP, AVI, MKV, WebM)")
@@ -122,11 +112,8 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoF
 
     Photos that EXIF turns are written anew, upright, as JPEG if they are JPEG; so are WebP and HEIC files and those of
     10, 12 or 14 bits in 16, which COLMAP cannot read. HEIC becomes JPEG, too; all others of these become 8-bit PNG,
-    brightened by the same factor.
-
-    Raises:
-        InputError: a photo is broken or truncated; it is named.
-        OSError: a photo cannot be copied.
+    brightened by the same factor. Raises InputError, which names the photo, if one is broken or truncated, and OSError
+    if one cannot be copied.
     """
     photos = []
     bits = max((sensor_bits(folder / name) for name in names), default=8)
@@ -174,16 +161,9 @@ def _describe_optics(image: Image.Image) -> tuple[str, float]:
 
 
 def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) -> list[list[PhotoFile]]:
-    """Photos that share one camera: focal length and distortion.
-
-    Args:
-        photos: in any order, which stays within a group.
-        shared: True: one camera took all; False: each photo has its own; None: photos of one folder, size and (EXIF)
-            focal length share one, and nearly one digital zoom, which jitters.
-
-    Raises:
-        InputError: photos of different sizes are to share one camera.
-    """
+    """Group photos that share one camera, focal length and distortion; their order stays. `shared` True: one camera
+    took all; False: each photo has its own; None: photos of one folder, size and (EXIF) focal length share one, and
+    nearly one digital zoom, which jitters. Raises InputError if photos of different sizes are to share one camera."""
     groups: dict[object, list[PhotoFile]] = defaultdict(list)
     zooms = sorted({photo.zoom for photo in photos})
     is_new = [after > STRUCTURE.zoom_step * before for before, after in pairwise(zooms)]

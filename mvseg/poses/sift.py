@@ -42,13 +42,8 @@ class Sift:
 
 
 def find_sift(photo: Photo, *, image_size: int, most: int) -> Sift:
-    """The features of most contrast.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB.
-        image_size: a photo whose longer side has more pixels is scaled down to it.
-        most: number of features that are kept.
-    """
+    """The features of most contrast of a photo (H, W, 3) uint8 RGB, at most `most`; a photo whose longer side has more
+    than `image_size` pixels is scaled down to it."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     factor = min(1.0, image_size / max(grey.shape))
     size = tuple(max(1, round(factor * side)) for side in grey.shape[::-1])
@@ -87,10 +82,8 @@ def count_alike(photos: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
 
 
 def match_descriptors(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """(M, 2) rows of descriptors (A, 128) and (B, 128) that match.
-
-    Each is the other's nearest, and nearer than `STRUCTURE.ratio` of the second nearest.
-    """
+    """(M, 2) rows of descriptors (A, 128) and (B, 128) that match: each is the other's nearest, and nearer than
+    `STRUCTURE.ratio` of the second nearest."""
     if min(len(one), len(other)) < 2:
         return np.zeros((0, 2), np.int64)
     one, other = (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9) for rows in (one, other))

@@ -41,8 +41,7 @@ class TableCamera:
     Attributes:
         K: (3, 3) float64, pixel centres at half integers.
         distortion: (5,) k1, k2, p1, p2, k3.
-        R: (3, 3) float64 of cam_from_world at angle 0.
-        t: (3,) float64 of cam_from_world at angle 0, in the unit of the scene.
+        R, t: (3, 3) and (3,) float64 of cam_from_world at angle 0, t in the unit of the scene.
         size: width and height of the photos.
         focal_deviation: standard deviation of the focal length, pixels; None where the lens was given.
     """

@@ -57,15 +57,8 @@ def is_video(path: Path) -> bool:
 
 
 def write_frames(clip: Path, folder: Path, numbers: Sequence[int]) -> list[str]:
-    """Write frames of a video into a new folder as JPEG, upright; returns their names, in order of time.
-
-    Args:
-        folder: made here.
-        numbers: of the frames, from 0.
-
-    Raises:
-        InputError: the video cannot be opened.
-    """
+    """Write frames of a video, by their numbers from 0, into a new folder as JPEG, upright; returns their names, in
+    order of time. Raises InputError if the video cannot be opened."""
     folder.mkdir(parents=True)
     names = []
     with _opened(clip) as video:
@@ -83,11 +76,8 @@ def frame_name(number: int) -> str:
 
 def watch(clip: Path) -> Footage:
     """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second. Warns (InputWarning) of a
-    video that ends early: it is cut short or damaged, or the first of its streams is shorter.
-
-    Raises:
-        InputError: the video cannot be opened, or has no frames.
-    """
+    video that ends early: it is cut short or damaged, or the first of its streams is shorter. Raises InputError if the
+    video cannot be opened, or has no frames."""
     numbers: list[int] = []
     motion: list[float] = []
     sharpness: list[float] = []
@@ -125,11 +115,9 @@ def check_motion(clip: Path, footage: Footage, chosen: Sequence[int]) -> None:
 
 
 def choose_frames(footage: Footage, *, most: int) -> list[int]:
-    """Numbers of frames that are about `VIDEO.step` (or a `most`-th of all motion, if that is more) apart.
-
-    The motion is cut into equal parts, and the sharpest frame in the middle half of each is taken: two in a row are
-    half a part to one and a half parts apart, where the video has frames there.
-    """
+    """Numbers of frames that are about `VIDEO.step` (or a `most`-th of all motion, if that is more) apart. The motion
+    is cut into equal parts, and the sharpest frame in the middle half of each is taken: two in a row are half a part to
+    one and a half parts apart, where the video has frames there."""
     total = float(footage.motion[-1])
     number = min(most, int(total / VIDEO.step + 1e-9))
     chosen: list[int] = []
@@ -143,13 +131,8 @@ def choose_frames(footage: Footage, *, most: int) -> list[int]:
 
 
 def fill_gaps(footage: Footage, chosen: Sequence[int], registered: Collection[int], *, most: int) -> list[int]:
-    """The chosen frames, and one in the middle of each gap of which an end did not register: photos there join the
-    others. At most `most` in all; the widest gaps first, by motion.
-
-    Args:
-        chosen: numbers of frames, ascending.
-        registered: those of them that have a pose.
-    """
+    """Add to the chosen frames, in ascending order, one in the middle of each gap of which an end did not register:
+    photos there join the others. At most `most` in all; the widest gaps first, by motion."""
     middles = []
     for before, after in pairwise(chosen):
         inside = np.flatnonzero((footage.frames > before) & (footage.frames < after))
@@ -170,11 +153,7 @@ class _Track:
 
 
 def _follow(track: _Track | None, grey: Grey) -> tuple[_Track, float, float]:
-    """The corners in the next picture; the median of how far they are from where they were found, and how much of that
-    is to be added to all that follows, since new corners are found. In longer sides.
-
-    A picture in which no corner is found again (a cut, a jerk) counts as `VIDEO.step`.
-    """
+    """Corners in the next picture; their motion since found, and what of it to add to all later, in longer sides."""
     if track is None or not len(track.now):
         return _find_corners(grey), 0.0, 0.0
     now, found = _flow(track.grey, grey, track.now)
@@ -225,10 +204,7 @@ def _opened(clip: Path) -> Iterator[cv2.VideoCapture]:
 def _read(
     video: cv2.VideoCapture, numbers: Sequence[int] | None = None, *, every: int = 1
 ) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Read numbers and frames (H, W, 3) BGR, with square pixels: the frames of given numbers, or one of every so many.
-
-    Behind a damaged place frames are smeared; they count, and are left out up to the next frame that stands alone.
-    """
+    """Numbers and frames (H, W, 3) BGR, in square pixels: given ones, or one of `every`; smeared ones are left out."""
     wanted = None if numbers is None else set(numbers)
     number = num_failed = 0
     is_smeared = False

@@ -30,11 +30,8 @@ NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # error
 
 
 def resolve_place(place: Path) -> Path:
-    """The absolute path of a place that need not exist, without links.
-
-    Raises:
-        InputError: its links form a loop, or its name cannot be one.
-    """
+    """The absolute path of a place that need not exist, without links. Raises InputError if its links form a loop, or
+    its name cannot be one."""
     try:
         place.stat()
     except ValueError:  # a null character
@@ -47,11 +44,7 @@ def resolve_place(place: Path) -> Path:
 
 def try_writing(folder: Path) -> None:
     """Make a nameless file in a folder: read-only disks and /proc look writable to whoever may do everything, and a
-    lock there would be waited for without end.
-
-    Raises:
-        OSError: nothing can be written there.
-    """
+    lock there would be waited for without end. Raises OSError if nothing can be written there."""
     try:
         with TemporaryFile(dir=folder):
             pass
@@ -60,11 +53,8 @@ def try_writing(folder: Path) -> None:
 
 
 def try_moving(place: Path) -> None:
-    """Move a file into a folder from beside it, as `folder_whole` will, and delete it.
-
-    Raises:
-        OSError: it cannot be moved there; EXDEV: the folder is a disk of its own.
-    """
+    """Move a file into a folder from beside it, as `folder_whole` will, and delete it. Raises OSError if it cannot be
+    moved there; EXDEV: the folder is a disk of its own."""
     handle, name = mkstemp(PARTIAL, ".", place.parent)
     os.close(handle)
     try:
@@ -81,11 +71,7 @@ def is_partial(path: Path) -> bool:
 
 def sweep_abandoned(place: Path) -> None:
     """Complete, undo or delete what killed runs left beside `place`, unless another run is writing it now. For whoever
-    is about to write there; see `wait_until_whole`.
-
-    Raises:
-        InputError: see `resolve_place`; or no run left what is there.
-    """
+    is about to write there; see `wait_until_whole`. Raises InputError as `resolve_place`, or if no run left it."""
     place = resolve_place(place)
     if not any(os.path.lexists(_beside(place, kind)) for kind in LEFT):
         return
@@ -99,11 +85,8 @@ def sweep_abandoned(place: Path) -> None:
 
 
 def wait_until_whole(place: Path) -> None:
-    """Wait while another run replaces the files of a folder that is to be read. Nothing is changed.
-
-    Raises:
-        InputError: see `resolve_place`; or a run was killed while it replaced them.
-    """
+    """Wait while another run replaces the files of a folder that is to be read; nothing is changed. Raises InputError
+    as `resolve_place`, or if a run was killed while it replaced them."""
     place = resolve_place(place)
     marks = [_beside(place, kind) for kind in (ASIDE, READY)]
     if not any(map(os.path.lexists, marks)):
@@ -124,11 +107,8 @@ def sweep_folder(folder: Path) -> None:
 
 @contextmanager
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Keep other runs out of a folder in which files are added one by one; the lock ends with the process.
-
-    Raises:
-        InputError: another process works in it, and `wait` is not set.
-    """
+    """Keep other runs out of a folder in which files are added one by one; the lock ends with the process. Raises
+    InputError if another process works in it, and `wait` is not set."""
     with _locked(folder / LOCK, wait=wait):
         yield
 
@@ -158,13 +138,9 @@ def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` make a file under a temporary name, then move it to `path`.
-
-    A reader, or a run that was killed at any moment, finds the old content or the new one. The folder must exist.
-
-    Raises:
-        OSError: the file cannot be written; nothing is left behind.
-    """
+    """Let `write` make a file under a temporary name, then move it to `path`, in a folder that exists. A reader, or a
+    run that was killed at any moment, finds the old content or the new one. Raises OSError if the file cannot be
+    written; nothing is left behind."""
     with _writing(path) as partial:
         partial.touch(exist_ok=False)
         write(partial)
@@ -180,12 +156,10 @@ def write_text_whole(path: Path, text: str) -> None:
 
 @contextmanager
 def folder_whole(place: Path, replaced: Callable[[Path], Collection[str]] = lambda _: ()) -> Iterator[Path]:
-    """A new folder to write into, whose files take the places of earlier ones in `place` when the block ends.
-
-    Of several processes, each waits for the one before it.
+    """Make a new folder to write into, whose files take the places of earlier ones in `place`, which may be new, when
+    the block ends. Of several processes, each waits for the one before it.
 
     Args:
-        place: the folder; it may be new.
         replaced: called with the new folder at the end; returns the names of the files in `place` that go. Everything
             else stays where it is: nobody needs to know what it is, nor to stop writing it.
 
@@ -212,12 +186,7 @@ def list_files(folder: Path) -> list[str]:
 
 
 def _move_files(names: Collection[str], source: Path, target: Path) -> None:
-    """Move files of a folder to the same places in another, where there are none, and delete the folders that become
-    empty by that.
-
-    Raises:
-        InputError: there is a file, or a link leads elsewhere: no run left it so.
-    """
+    """Move files to the same places in another folder, where none may be, and delete folders that become empty."""
     for name in names:
         links = [target / each for each in Path(name).parents if (target / each).is_symlink()]
         if links or os.path.lexists(target / name):
@@ -253,11 +222,7 @@ def _sync_folder(folder: Path) -> None:
 
 @contextmanager
 def _writing(place: Path) -> Iterator[Path]:
-    """A temporary name beside a place for this process alone; what is there at the end is deleted.
-
-    Raises:
-        OSError: as raised inside; it names `place` where it names nothing (a full disk) or the temporary name.
-    """
+    """A temporary name beside a place, deleted at the end, for this process alone; an OSError names `place`."""
     try:
         with _locked(_beside(place, LOCK), wait=True):
             try:
@@ -278,14 +243,7 @@ def _beside(place: Path, kind: str) -> Path:
 
 
 def _settle(place: Path) -> None:
-    """Complete, undo or delete the remains of an earlier write, under the lock.
-
-    At every moment, what remains says which files win: `.mvseg-ready` outlives the files that were put aside.
-
-    Raises:
-        InputError: no run left what is there.
-        OSError: something cannot be moved or deleted; it stays for the next time.
-    """
+    """Complete, undo or delete the remains of an earlier write, under the lock; they always say which files win."""
     partial, aside, ready = (_beside(place, kind) for kind in (PARTIAL, ASIDE, READY))
     for mark in (aside, ready):
         if mark.is_symlink() or (mark.exists() and not mark.is_dir()):

@@ -1,4 +1,4 @@
-"""What is in a file or a folder, as one number."""
+"""Content of a file or a folder as one number."""
 
 from __future__ import annotations
 
@@ -10,11 +10,8 @@ CHUNK = 1 << 20  # limit: bytes that are read at once
 
 
 def hash_files(path: Path, *, most_bytes: int | None = None) -> str:
-    """SHA-256 of a file; of a folder, that of the lines "<SHA-256 of the file>  <its path>", sorted by path.
-
-    Raises:
-        OSError: it cannot be read; it is a device or a pipe, which may have no end; or it has more than `most_bytes`.
-    """
+    """SHA-256 of a file; of a folder, that of the lines "<SHA-256 of the file>  <its path>", sorted by path. Raises
+    OSError if it cannot be read, is a device or a pipe, which may have no end, or has more than `most_bytes`."""
     if path.is_dir():
         lines, remaining = [], most_bytes
         for each in sorted(each for each in path.rglob("*") if each.is_file()):

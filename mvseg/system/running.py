@@ -109,13 +109,8 @@ def running(
 
 @contextmanager
 def timed(stage: str) -> Iterator[None]:
-    """A stage of a run: `Running.seconds` has its wall time, the sum if it comes more than once.
-
-    It computes on one thread, unless a network does the work (`NETWORKS`).
-
-    Raises:
-        Cancelled: the run is not wanted any more.
-    """
+    """A stage of a run, on one thread unless a network does the work (`NETWORKS`): `Running.seconds` has its wall time,
+    the sum if it comes more than once. Raises `Cancelled` if the run is not wanted any more."""
     now = now_running()
     if now.is_cancelled():
         raise Cancelled
@@ -128,8 +123,7 @@ def timed(stage: str) -> Iterator[None]:
 
 
 def report_step(sentence: str) -> None:
-    """Report the present step to the callback of the run, or print it beside the progress bars; nothing in a silent
-    run."""
+    """Report the present step to the callback of the run, or print it beside the bars; nothing in a silent run."""
     if (report := now_running().report) is not None:
         report(sentence)
     elif now_running().progress:
@@ -160,8 +154,7 @@ def progress_bar(
 
 
 class _Part:
-    """A bar of one stage: told to who asked for reports, or a part of the whole command's line; in a file or a pipe, a
-    name has a line at its first end."""
+    """A bar of one stage: reported, or part of the command's line; in a file or a pipe, a line at its first end."""
 
     def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, *, unit: str) -> None:
         self.items, self.name, self.unit, self.n = items, name, unit, 0
@@ -189,7 +182,6 @@ class _Part:
             say(now.whole.text, to_stderr=True)
 
     def update(self, more: int = 1) -> None:
-        """So many more are done."""
         self.n += more
         self._show(ends=False)
 

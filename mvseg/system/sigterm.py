@@ -17,16 +17,13 @@ class Terminated(BaseException):
 
 @contextmanager
 def stopped_by_sigterm() -> Iterator[None]:
-    """SIGTERM raises `Terminated` in this block, which belongs to the main thread.
-
-    pycolmap installs a handler of its own, which prints a C++ trace and may hang: so pycolmap is imported here, with
-    the signal blocked, before ours is set. Ctrl-C is blocked, too: pycolmap would report that it is not installed.
-    """
+    """SIGTERM raises `Terminated` in this block, which belongs to the main thread. pycolmap installs a handler of its
+    own, which prints a C++ trace and may hang: so pycolmap is imported here, with the signal blocked, before ours is
+    set. Ctrl-C is blocked, too: pycolmap would report that it is not installed."""
     earlier_hook = sys.unraisablehook
 
     def insist(unraisable: sys.UnraisableHookArgs) -> None:
-        """Python swallows what is raised in a finaliser, or in the hooks around a fork (data loaders fork), and reports
-        it here: the signal is then raised again."""
+        """Raise the signal again that Python swallowed in a finaliser, or around a fork (data loaders fork)."""
         how = unraisable.exc_type
         if issubclass(how, (Terminated, KeyboardInterrupt)) and hasattr(signal, "setitimer"):
             signal.signal(signal.SIGALRM, partial(_end, how))
@@ -50,8 +47,7 @@ def stopped_by_sigterm() -> Iterator[None]:
 
 @contextmanager
 def held_back(*signals: signal.Signals) -> Iterator[None]:
-    """Delay these signals to the end of the block. This works as long as no library has started threads, which would
-    receive them. (Windows cannot block signals.)"""
+    """Delay these signals to the end of the block, while no library's threads would receive them (not on Windows)."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

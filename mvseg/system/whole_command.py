@@ -1,4 +1,4 @@
-"""One line on the terminal: how far a command is, and how long all that is left will take."""
+"""One line on the terminal: how far a command is, and how long the rest will take."""
 
 from __future__ import annotations
 
@@ -19,12 +19,7 @@ KNOWN = 0.03  # chosen: part of a command after which its speed is known
 
 
 class WholeCommand:
-    """How far a command is; it never goes back, whatever the run repeats.
-
-    Attributes:
-        to_come: planned stages.
-        text: of the line.
-    """
+    """How far a command is, never back again; `to_come` are the planned stages, `text` is that of the line."""
 
     def __init__(self, stages: Sequence[str]) -> None:
         self.to_come = list(stages)

@@ -30,11 +30,8 @@ AHEAD = 16  # limit: items queued for the workers: a slow one blocks no others, 
 
 
 def start_workers(num_workers: int) -> AbstractContextManager[ProcessPoolExecutor | None]:
-    """A pool of up to `num_workers` processes, see `start_pool`; None for one: the caller does the work.
-
-    Raises:
-        InputError: fewer than one.
-    """
+    """A pool of up to `num_workers` processes, see `start_pool`; None for one: the caller does the work. Raises
+    InputError for fewer than one."""
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     return nullcontext() if num_workers == 1 else start_pool(num_workers)
@@ -43,10 +40,7 @@ def start_workers(num_workers: int) -> AbstractContextManager[ProcessPoolExecuto
 @contextmanager
 def start_pool(num_workers: int) -> Iterator[ProcessPoolExecutor]:
     """A pool of spawned processes, started on demand. At the end of the block they are stopped at once, whatever they
-    are doing.
-
-    A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
-    """
+    do. A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes."""
     before = os.environ.get(SAFE_PATH)
     os.environ[SAFE_PATH] = "1"  # no process of it imports a module of the user's folder
     try:
@@ -80,14 +74,8 @@ def load_ahead(workers: ProcessPoolExecutor | None, num_workers: int, module: st
 def map_in_order(
     work: Callable[[Item], Answer], items: Iterable[Item], workers: ProcessPoolExecutor | None
 ) -> Iterator[Answer]:
-    """`map(work, items)`, in processes of the pool if there is one; their warnings are given here.
-
-    Args:
-        work: what a module holds, or `partial` of it.
-
-    Raises:
-        InputError: a process was killed.
-    """
+    """`map(work, items)`, in processes of the pool if there is one; their warnings are given here. `work` is what a
+    module holds, or `partial` of it. Raises InputError if a process was killed."""
     if workers is None:
         yield from map(work, items)
         return
@@ -115,13 +103,7 @@ def run_all(work: Callable[[Item], Answer], items: Iterable[Item], num_workers: 
 
 
 def _start_worker(parent: Connection) -> None:
-    """Prepare a process of the pool: its libraries use one thread, those that its main module loaded, too; it exits as
-    soon as the parent closes its end of the pipe or dies, and silently on SIGTERM (pycolmap's handler would print a
-    trace).
-
-    Ctrl-C is left to the parent. A worker that outlives a killed parent would continue with its queue and interfere
-    with the next run.
-    """
+    """Prepare a process of the pool: one thread, an end with its parent's, silent on SIGTERM, deaf to Ctrl-C."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()

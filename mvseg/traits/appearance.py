@@ -1,4 +1,4 @@
-"""How much of each leaf the photos show, and in which colour."""
+"""Visible share and colour of each leaf in the photos."""
 
 from __future__ import annotations
 
@@ -30,20 +30,9 @@ GREY = missing("not measured: the photos are grey")
 def measure_appearance(
     surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
 ) -> dict[int, dict[str, Measurement]]:
-    """Visible share, mean colour and greenness of leaves.
-
-    Args:
-        surfaces: {instance id: surface that exists}.
-        masks: D masks of the scene, with ids.
-        photos: used, if they exist.
-
-    Returns:
-        {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
-        there is none with one view. Grey photos have no part in colours.
-
-    Raises:
-        InputError: a photo is broken, or missing while others exist.
-    """
+    """Visible share, mean colour and greenness of leaves, {instance id: {trait: number}}; photos are used, if they
+    exist. The standard deviation of a colour is the standard error over the views, so there is none with one view. Grey
+    photos have no part in colours. Raises InputError if a photo is broken, or missing while others exist."""
     has_photos, has_colors = bool(surfaces) and photos.exist, False
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # see `mean_colors`

@@ -1,5 +1,4 @@
-"""Which instances count as leaves. The fields of `TraitsConfig` are keys in YAML files and options on the command
-line."""
+"""Choice of the instances that count as leaves; fields of `TraitsConfig` are YAML keys and command line options."""
 
 from __future__ import annotations
 

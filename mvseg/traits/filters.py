@@ -1,4 +1,4 @@
-"""Which instances are no leaves to be measured, and why."""
+"""Instances that are no leaves to be measured, and why."""
 
 from __future__ import annotations
 
@@ -32,18 +32,12 @@ def find_rejected(
     visible_shares: Mapping[int, float] = MappingProxyType({}),
     stems: Mapping[int, float] = MappingProxyType({}),
 ) -> dict[int, Rejection]:
-    """The instances that are not measured as leaves.
+    """The instances that are not measured as leaves, {instance id: the gravest of its reasons, see `Kind`}.
 
     Args:
-        surfaces: {instance id: its surface}, instances without one left out.
-        config: what is asked of a leaf.
         sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
-        visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
-            surface.
+        visible_shares: {instance id: share of its surface, over all photos, that its masks cover}.
         stems: {instance id of a long instance: probability that it is a stem}.
-
-    Returns:
-        {instance id: why}: the gravest of several reasons, see `Kind`.
     """
     ious = {instance: median_iou(surface) for instance, surface in surfaces.items()}
     share = "its masks cover a share of {:.2f} of its surface, asked for is {:g}"

@@ -23,14 +23,8 @@ FULL_TURN_DEG = 360 - 5e-4  # limit: what is larger is written as 360, with six 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A number, or why there is none.
-
-    Attributes:
-        value: NaN where there is none.
-        sd: standard deviation; NaN where there is none.
-        method: what it was measured on ("surface", "voxels", "masks", "photographs"); the reason where
-            there is none.
-    """
+    """A number and its standard deviation, each NaN where there is none; `method` is what it was measured on
+    ("surface", "voxels", "masks", "photographs"), or the reason why there is none."""
 
     value: float
     sd: float
@@ -46,8 +40,7 @@ class Measurement:
 
 
 def say_number(value: float, sd: float) -> str:
-    """A number with two digits of its standard deviation, if that is known; ASCII, since not every terminal knows
-    more."""
+    """A number with two digits of its standard deviation, if known; in ASCII, since some terminals know no more."""
     if not np.isfinite(sd) or sd <= 0:
         return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
     decimals = 1 - int(np.floor(np.log10(sd)))
@@ -67,15 +60,12 @@ NEED_UP = ("inclination", *NEED_BASE)
 
 
 def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 0.0) -> dict[str, Measurement]:
-    """All of `SURFACE_TRAITS` of one leaf.
+    """All of `SURFACE_TRAITS` of one leaf, {trait: number}, from a credible surface; those that need up, or base and
+    tip, say so where these are not known. Angles are in degrees.
 
     Args:
-        surface: credible.
         frame: (3, 3) rows east, north, up (`level_frame`); None: up is not known.
         ground: height that insertion heights start from, along up, world units.
-
-    Returns:
-        {trait: number}; those that need up, or base and tip, say so where these are not known. Angles in degrees.
     """
     coefficients = surface.coefficients.numpy()
     normals = cell_normals(patch_grid(*COARSE).points(coefficients))
@@ -141,8 +131,7 @@ def _base_height(coefficients: Floats, frame: Floats | None) -> Floats:
 
 
 def _directions(coefficients: Floats, frame: Floats | None, *, normal: Floats) -> dict[str, tuple[Floats, Floats]]:
-    """{angle: the two directions (..., 3), of any length, that it lies between} of leaves (..., 26, 3), and their mean
-    normals (..., 3)."""
+    """{angle: the two directions (..., 3) that it lies between} of leaves (..., 26, 3) with mean normals (..., 3)."""
     ends, (left, middle, right) = (np.moveaxis(rows @ coefficients, -2, 0) for rows in (_ENDS, _HALVES))
     base, ahead, tip = ends[1:] - ends[:-1]
     pairs = {"curvature": (base, tip), "fold_angle": (left - middle, right - middle)}
@@ -157,15 +146,7 @@ def _directions(coefficients: Floats, frame: Floats | None, *, normal: Floats) -
 
 @dataclass(frozen=True, eq=False)
 class _Angle:
-    """An angle between two directions, signed within the plane that they span on the leaf as fitted.
-
-    When the leaf moves, it passes smoothly through 0 and 180 degrees, where the angle between two directions itself
-    has a kink: standard deviations need that.
-
-    Attributes:
-        ahead, across: (3,) orthonormal; the plane.
-        degrees: the angle on the leaf as fitted; NaN where a direction has no length.
-    """
+    """An angle in the plane of orthonormal `ahead` and `across`, signed: it has no kink at 0 and 180 degrees."""
 
     ahead: Floats
     across: Floats

@@ -1,4 +1,4 @@
-"""The traits of a plant and of its leaves, start to finish."""
+"""Traits of a plant and of its leaves, start to finish."""
 
 from __future__ import annotations
 
@@ -40,10 +40,9 @@ NO_MASKS = LeafSurface.none(torch.zeros(0, dtype=torch.int64), "no_masks", "has 
 
 @dataclass(frozen=True, eq=False)
 class LeafTraits:
-    """One instance.
+    """One instance; `leaf` is its id.
 
     Attributes:
-        leaf: its id.
         numbers: {trait: number} of all `LEAF_TRAITS`.
         method: "surface", "voxels", or "none" for an instance without a shape.
         reasons: {code: sentence} of the reasons to doubt the numbers, or why there are none; empty for a good leaf.
@@ -150,9 +149,7 @@ def measure_plant(
 
     Args:
         scene: gives unit and the direction of up (None: angles and heights are left out).
-        matching: D masks with their ids.
         surfaces: {instance id: surface}; None where none were asked for.
-        voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
         stems: ids of instances that are stems, as the user says.
         probabilities: {instance id: how likely it is a leaf}, where the views chose it.
@@ -252,10 +249,8 @@ def describe_leaf(
     unit: str,
 ) -> LeafTraits:
     """The leaf with all of its traits, from the `numbers` that were measured; those that are missing with the reason.
-
     `shape` stands for it; `fitted` is its surface, credible or not, None where no surfaces were asked for; `rejection`
-    says why it does not count as a leaf.
-    """
+    says why it does not count as a leaf."""
     reasons = {} if fitted is None else dict(fitted.quality.reasons)
     if shape is None and fitted is None:
         reasons = {"no_shape": "has no shape: seen in one view, or its masks agree on no point"}

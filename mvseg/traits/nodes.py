@@ -1,4 +1,4 @@
-"""Nodes: where the leaves join the stem, in their order, and the phyllotaxis that they suggest."""
+"""Nodes, the places where leaves join the stem, in their order, and the phyllotaxis that they suggest."""
 
 from __future__ import annotations
 
@@ -30,13 +30,11 @@ FIRST_NODE = missing("not measured: the lowest node has none below")
 
 @dataclass(frozen=True)
 class Node:
-    """Place where one leaf joins a stem.
+    """Place where one leaf joins a stem; `leaf` is an instance id.
 
     Attributes:
         number: 1 for the lowest one of its stem.
-        leaf: instance id.
-        place: (x, y, z) on the axis.
-        base: (x, y, z) of the blade.
+        place, base: (x, y, z) on the axis, and of the blade.
         height: along the axis, from the foot of the stem or, where that is not known, from the lowest node.
         internode: along the axis, from the node below.
         divergence: degrees between its azimuth and that of the node below, in [0, 180].
@@ -75,14 +73,12 @@ UNCLEAR = Phyllotaxis("unclear", float("nan"), float("nan"))
 
 @dataclass(frozen=True, eq=False)
 class Stem:
-    """One stem with its nodes.
+    """One stem with its nodes, and the phyllotaxis that these suggest; `number` 1, 2, ... of the plant.
 
     Attributes:
-        number: 1, 2, ... of the plant.
         tube: upwards; of no radius where no view shows how thick it is.
         source: what showed it: "masks", "photos" or "leaf bases".
         nodes: from the lowest to the highest one.
-        phyllotaxis: that they suggest.
         tells_up: whether the direction in which it grows may be taken for up.
     """
 
@@ -107,13 +103,9 @@ def measure_stem(
     knows_foot: bool = False,
     tells_up: bool = False,
 ) -> Stem:
-    """Order leaves along a stem, and measure their nodes.
-
-    Args:
-        bases: of the leaves that sit on it.
-        frame: (3, 3) rows east, north, up (`level_frame`); None: azimuths start somewhere.
-        knows_foot: heights start where the tube does, not at the lowest node.
-    """
+    """Order the leaves that sit on a stem along it, and measure their nodes. `frame` has the (3, 3) rows east, north,
+    up (`level_frame`); None: azimuths start somewhere. With `knows_foot` heights start with the tube, not the lowest
+    node."""
     curve = curve_of(tube)
     places, misses, along = project_bases(bases, curve)
     steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
@@ -196,11 +188,9 @@ def _apart(first: float, second: float) -> float:
 
 
 def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:
-    """Compare how likely the azimuths and heights of nodes, upwards, are with each phyllotaxis.
-
-    All four are equally likely beforehand: distichous, decussate (pairs at right angles), a spiral of any angle in
-    `SPIRAL_DEG`, either way round, and none of these.
-    """
+    """Compare how likely the azimuths and heights of nodes, upwards, are with each phyllotaxis. All four are equally
+    likely beforehand: distichous, decussate (pairs at right angles), a spiral of any angle in `SPIRAL_DEG`, either way
+    round, and none of these."""
     if len(nodes) < LEAST_NODES:
         return UNCLEAR
     azimuth = np.array([node.azimuth.value if node.azimuth.exists else 0.0 for node in nodes])
@@ -238,8 +228,7 @@ def _log_mean(logs: Floats) -> float:
 
 
 def _pair_azimuths(azimuth: Floats, sd: Floats, first: int) -> float:
-    """Logarithm of the density of azimuths (N,) of opposite leaves, each pair at right angles to the one before; the
-    lowest one is alone where `first` is 1. Within a pair the order means nothing."""
+    """Log density of azimuths (N,) of opposite leaves, pairs at right angles; the lowest is alone if `first` is 1."""
     pair = (np.arange(len(azimuth)) + first) // 2
     total = np.zeros(len(START_DEG))
     for number in np.unique(pair):

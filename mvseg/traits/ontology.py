@@ -14,15 +14,8 @@ Kind = Literal["length", "area", "volume", "degree", "1"]
 
 @dataclass(frozen=True)
 class Definition:
-    """One trait.
-
-    Attributes:
-        name: as in the tables.
-        kind: what its unit is made of; "1" for counts, shares and ratios.
-        meaning: in one line.
-        ontology: accession, "" without one.
-        has_sd: is there a standard deviation (and a column for it)?
-    """
+    """One trait. `kind` is what its unit is made of, "1" for counts, shares and ratios; `ontology` the accession, ""
+    without one; `has_sd` says whether there is a standard deviation (and a column for it)."""
 
     name: str
     kind: Kind

@@ -35,14 +35,10 @@ def measure_whole(
     num_leaves: int,
     useless: Collection[int] = (),
 ) -> dict[str, Measurement]:
-    """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id.
-
-    Args:
-        frame: (3, 3) rows east, north, up; None where up is not known.
-        num_leaves: all leaves, those without a surface, too.
-        useless: ids of leaves whose numbers are not to be used: the total area is without them, and its method says
-            which they are, and their area. They count in the height and in the hull, which would be too small.
-    """
+    """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id. `frame` has the (3, 3) rows east,
+    north, up, None where up is not known; `num_leaves` counts leaves without a surface, too. The total area is without
+    `useless` leaves, and its method says which they are, and their area. They count in the height and in the hull,
+    which would be too small."""
     numbers = {"number_of_leaves": Measurement(float(num_leaves), float("nan"), "matching")}
     if not surfaces:
         return numbers | dict.fromkeys(FROM_SURFACES, NO_LEAVES)

@@ -1,4 +1,4 @@
-"""The stems of a plant, from what shows it: the bases of its leaves, and thin parts in its photos."""
+"""Stems of a plant, from the bases of its leaves and from thin parts in its photos."""
 
 from __future__ import annotations
 
@@ -57,8 +57,7 @@ LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter o
 def find_tubes(
     surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, stems: Collection[int], is_asked: bool
 ) -> dict[int, TubeEvidence]:
-    """Evidence by instance id: of `stems`, as the user says, and of the others that are
-    slender enough to be one, if that `is_asked`."""
+    """Evidence by instance id: of `stems`, as the user says, and, if `is_asked`, of others slender enough to be one."""
     regions, ids = masks.regions, masks.instance_ids
     known = {instance: surface for instance, surface in surfaces.items() if instance in stems}
     others = {instance: surface for instance, surface in surfaces.items() if instance not in stems}
@@ -77,21 +76,16 @@ def find_stems(
     photos: Photos,
     tubes: Sequence[StemTube] = (),
 ) -> tuple[Stem, ...]:
-    """Find the stems that the leaves of a plant sit on, and their nodes.
+    """Find the stems that the leaves of a plant sit on, that of the most leaves first, and their nodes.
 
     Masks that show stems tell best. Otherwise leaves point back to them; where photos exist, these must show something
     thin there. Where leaves point to no stem, as those that are wider than long, the cheapest path through thin parts
-    between them is one.
+    between them is one. There is none where leaves and views do not agree about one.
 
     Args:
         surfaces: {instance id: credible surface} of leaves.
-        masks: D masks of the scene, with ids.
         frame: (3, 3) rows east, north, up; None: up is not known.
-        photos: used, if they exist.
         tubes: fitted to masks of stems, see `tubes_of_masks`.
-
-    Returns:
-        The stems, that of the most leaves first; none where leaves and views do not agree about one.
     """
     if not surfaces:
         return ()
@@ -142,13 +136,7 @@ def _rises(tube: Tube, up: Floats) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class SeenPlant:
-    """Thin parts of a plant.
-
-    Attributes:
-        views: of `see_thin`.
-        cells: that they agree about.
-        leaves: {instance id: (P, 3) points on its surface}.
-    """
+    """Thin parts of a plant: `cells` that `views` of `see_thin` agree about; `leaves` are (P, 3) points by id."""
 
     views: tuple[ThinView, ...]
     cells: ThinCells
@@ -191,15 +179,9 @@ class StemTube:
 def tubes_of_masks(
     stems: Collection[int], tubes: Mapping[int, Tube], masks: Masks, cameras: Cameras
 ) -> tuple[StemTube, ...]:
-    """The tubes of instances that are stems. Masks that were drawn for each internode are one stem: those of which an
-    end meets another one's are fitted together. Warns (InputWarning) of masks that hold the pot, too: the foot of such
-    a stem is not known.
-
-    Args:
-        stems: ids of the instances.
-        tubes: {id: tube} of all of them.
-        masks: D masks of the scene, with ids.
-    """
+    """Select the tubes of instances that are stems, from those of all, by id. Masks that were drawn for each internode
+    are one stem: those of which an end meets another one's are fitted together. Warns (InputWarning) of masks that hold
+    the pot, too: the foot of such a stem is not known."""
     regions, cameras, joined = masks.regions.to("cpu"), cameras.to("cpu"), []
     for ids in _join_ends({stem: tubes[stem] for stem in sorted(stems) if tubes[stem].exists}):
         of_stem = torch.isin(masks.instance_ids.cpu(), torch.tensor(ids)) & (regions.areas > 0)
@@ -291,11 +273,7 @@ def _of_bases(axes: tuple[BaseAxis, ...], frame: Floats | None, *, tells_up: boo
 def _of_path(
     path: StemPath, surfaces: Mapping[int, LeafSurface], frame: Floats | None, upward: Floats | None
 ) -> tuple[Stem, ...]:
-    """The stem of a path, if it has enough leaves.
-
-    Petioles that were traced tell the nodes, whichever end of a leaf is its base; of the other leaves the midribs do,
-    where they point back to the path.
-    """
+    """The stem of a path, if it has enough leaves; traced petioles tell nodes, else midribs that point back to it."""
     ends, others = find_ends(surfaces)
     rising = (ends.points + others.points).mean(0) / 2 - path.points[0] if upward is None else upward
     line = path.points if (path.points[-1] - path.points[0]) @ rising >= 0 else path.points[::-1]
@@ -313,8 +291,7 @@ def _of_path(
 
 
 def petiole_bases(path: StemPath, surfaces: Mapping[int, LeafSurface]) -> LeafBases:
-    """The bases of leaves whose petioles were traced without a long gap: where they join the stem, and their direction
-    there."""
+    """Bases of leaves whose petioles were traced without a long gap: where they join the stem, and their direction."""
     ids = [leaf for leaf, way in path.petioles.items() if _longest_step(way) <= MOST_GAP * path.cell]
     starts, ahead, near = [], [], []
     for leaf in ids:

@@ -27,10 +27,8 @@ VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 
 
 def write_long(path: Path, traits: Traits) -> None:
-    """One row per trait: those of the plant, whose leaf is empty, then those of each leaf.
-
-    In the row of a missing number, `method` is the reason. Leaves without voxels have no rows for these.
-    """
+    """Write one row per trait: those of the plant, whose leaf is empty, then those of each leaf. In the row of a
+    missing number, `method` is the reason. Leaves without voxels have no rows for these."""
     rows = []
     tables: list[tuple[str | int, Mapping[str, Measurement]]] = [("", traits.whole)]
     for leaf, numbers in [*tables, *((leaf.leaf, leaf.numbers) for leaf in traits.leaves)]:
@@ -65,11 +63,7 @@ def write_nodes(path: Path, traits: Traits) -> None:
 
 
 def read_nodes(path: Path) -> tuple[Stem, ...]:
-    """The stems whose nodes `write_nodes` wrote; their axes lead straight from node to node.
-
-    Raises:
-        InputError: it is no such table.
-    """
+    """The stems that `write_nodes` wrote, with straight axes from node to node. Raises InputError for another table."""
     nodes: dict[int, list[Node]] = {}
     about: dict[int, tuple[str, Phyllotaxis]] = {}
     try:
@@ -116,11 +110,7 @@ def read_traits(
     rejected: Mapping[int, Kind] = MappingProxyType({}),
 ) -> Traits:
     """The traits that `write_long`, `write_wide` and `write_nodes` wrote, with six digits; what the tables do not say
-    is given, as {leaf: kind of its rejection}.
-
-    Raises:
-        InputError: these are no such tables.
-    """
+    is given, as {leaf: kind of its rejection}. Raises InputError if these are no such tables."""
     numbers: dict[int, dict[str, Measurement]] = {0: {}}
     try:
         for row in read_csv(long, COLUMNS):
@@ -158,11 +148,8 @@ def _read_leaf(
 
 
 def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:
-    """The rows of a table that `write_table` wrote, with these columns and perhaps others, as text.
-
-    Raises:
-        InputError: it cannot be read, or has no such column.
-    """
+    """The rows of a table that `write_table` wrote, with these columns and perhaps others, as text. Raises InputError
+    if it cannot be read, or has no such column."""
     (_, header), *rows = read_table(path, "a table that mvseg wrote", most=MOST_BYTES) or [(0, [])]
     missing_ones = [column for column in columns if column not in header]
     if missing_ones:

@@ -1,6 +1,4 @@
-"""The world that the user asks for: the scale and the unit of its lengths, and which way is up: as the user says, or as
-cameras or markers that lie flat show.
-"""
+"""The world that the user asks for: scale, unit, and up, as the user says or as level cameras or flat markers show."""
 
 from __future__ import annotations
 
@@ -33,19 +31,12 @@ def place_scene(
     unit: str | None = None,
     up: Up | None = None,
 ) -> Scene:
-    """The scene in the world that the user asks for; None leaves what the scene says.
+    """The scene in the world that the user asks for; None leaves what the scene says. Its lengths are multiplied by
+    `scale`, and are then in `unit`; photos, where none are given, are read if `up` is "board".
 
     Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale, and of an up that the cameras
-    contradict (`Scene.seems_upside_down`).
-
-    Args:
-        photos: of the scene; None: they are read where `up` is "board".
-        scale: its lengths are multiplied by this.
-        unit: name of the unit of the lengths after that.
-
-    Raises:
-        InputError: a scale of cameras that say their unit, without the unit of the lengths after it; up cannot be
-            found, see `find_up`.
+    contradict (`Scene.seems_upside_down`). Raises InputError for a scale of cameras that say their unit, without the
+    unit of the lengths after it, and if up cannot be found, see `find_up`.
     """
     if scale is not None:
         if unit is None and scene.unit and scale != 1:
@@ -63,12 +54,8 @@ def place_scene(
 
 
 def find_up(scene: Scene, up: Up | None, photos: Photos | None = None) -> Scene:
-    """The scene with the direction of up that the user says, or else its own.
-
-    Raises:
-        InputError: "rig" or "board" where these do not tell it, see `up_of_cameras` and `up_of_board`; a vector
-            without a direction.
-    """
+    """The scene with the direction of up that the user says, or else its own. Raises InputError for "rig" or "board"
+    where these do not tell it, see `up_of_cameras` and `up_of_board`, and for a vector without a direction."""
     if up is None:
         return scene
     if isinstance(up, str):
@@ -79,11 +66,8 @@ def find_up(scene: Scene, up: Up | None, photos: Photos | None = None) -> Scene:
 
 def up_of_cameras(cameras: Cameras) -> Floats:
     """(3,) unit vector up, from V cameras that were held level, at any height and pitch: it is perpendicular to the
-    horizontal axes of their photos.
-
-    Raises:
-        InputError: the cameras were not held level, or all look in nearly the same direction.
-    """
+    horizontal axes of their photos. Raises InputError if the cameras were not held level, or all look in nearly the
+    same direction."""
     R = cameras.R.cpu().numpy()
     _, sizes, axes = np.linalg.svd(R[:, 0], full_matrices=True)
     sizes = np.append(sizes, [0.0] * (3 - len(sizes))) / np.sqrt(len(R))
@@ -97,13 +81,9 @@ def up_of_cameras(cameras: Cameras) -> Floats:
 
 
 def up_of_board(scene: Scene, photos: Photos | None = None) -> Floats:
-    """(3,) unit vector up: the normal of the plane of all ArUco or ChArUco markers, on the side of the cameras.
-
-    The family of markers with the most corners in space counts.
-
-    Raises:
-        InputError: a photo is missing or broken; no marker is seen in two photos, or the markers lie in no one plane.
-    """
+    """(3,) unit vector up: the normal of the plane of all ArUco or ChArUco markers, on the side of the cameras. The
+    family of markers with the most corners in space counts. Raises InputError if a photo is missing or broken, no
+    marker is seen in two photos, or the markers lie in no one plane."""
     found = [triangulate_points(scene.cameras, seen) for seen in find_scene_markers(photos or Photos(scene)).values()]
     corners = np.array(list(max(found, key=len).values()))
     if not len(corners):

@@ -27,18 +27,11 @@ BAND = 1024  # limit: rows that are looked at together; neighbours across are no
 
 def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> None:
     """Warn (InputWarning) if label images hold 0 and 255 only, or if a number has components far apart in most of the
-    photos with masks.
+    photos with masks. `between` is the sum of the `count_between` of all label images; messages name `source`.
 
     A partly occluded leaf has several components, too, but near each other or in few photos: on basil and maize with a
-    number per leaf, in less than a third of the photos.
-
-    Args:
-        between: the sum of the `count_between` of all label images.
-        source: the file or folder; messages name it.
-
-    Raises:
-        InputError: most of the many numbers of a view have components far apart, as the grey values of a photo do; or
-            see `is_interpolated`.
+    number per leaf, in less than a third of the photos. Raises InputError if most of the many numbers of a view have
+    components far apart, as the grey values of a photo do, or if label images were scaled, see `is_interpolated`.
     """
     if len(regions) and bool((regions.labels == BINARY).all()):
         warn(Finding("one_number", str(source)))
@@ -82,8 +75,7 @@ def count_between(labels: np.ndarray) -> np.ndarray:
 
 
 def _of_neighbours(band: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """The least or the largest number of each pixel and its neighbours. OpenCV's threads do not survive the fork of a
-    data loader, which reads label images, too."""
+    """Least or largest number of each pixel and its neighbours, without OpenCV, whose threads do not survive a fork."""
     for axis in (0, 1):
         before, spread = np.moveaxis(band, axis, 0), band.copy()
         after = np.moveaxis(spread, axis, 0)

@@ -1,4 +1,4 @@
-"""What makes masks of any kind useless, or their ids wrong: the errors of `mvseg check`, which every command says."""
+"""Faults that make masks useless, or their ids wrong: errors of `mvseg check`, which every command reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every mask reader returns, and the selection by category."""
+"""Result of every mask reader, and the selection by category."""
 
 from __future__ import annotations
 
@@ -16,10 +16,9 @@ MANY_PARTS = 4  # chosen: shapes of one leaf from which they are suspicious
 
 @dataclass(frozen=True, eq=False)
 class FoundMask:
-    """One entry of a file of masks.
+    """One entry of a file of masks; `label` is its number there.
 
     Attributes:
-        label: its number in the file.
         mask: (H, W) bool, in the frame of the photo; None for a box, a line or a point, which show no pixels.
         category: what it shows ("leaf"); "" where the format has no categories.
         num_parts: shapes that it is made of.
@@ -42,17 +41,9 @@ def check_parts(masks: Iterable[FoundMask], source: object) -> None:
 def check_categories(
     counts: Mapping[str, int], wanted: Collection[str], *, categories: Collection[str] = (), source: Path
 ) -> None:
-    """Warn (InputWarning) if masks of several categories are treated alike, and if no mask is of a wanted one.
-
-    Args:
-        counts: how many masks each category has.
-        wanted: the requested categories; empty for all.
-        categories: categories that the file lists, with or without masks.
-        source: the file or folder; messages name it.
-
-    Raises:
-        InputError: a wanted category is not there.
-    """
+    """Warn (InputWarning) if masks of several categories are treated alike, and if no mask is of a wanted one (empty:
+    all). `counts` are the masks of each category, `categories` those that the file lists, with or without masks. Raises
+    InputError if a wanted category is not there; messages name `source`."""
     present = [name for name in dict.fromkeys([*categories, *counts]) if name]
     for name in wanted:
         if name not in present:

@@ -43,13 +43,9 @@ class LabelmeFile(BaseModel):
 
 
 def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
-    """The masks of a photo, numbered from 1 in the order of their first shapes; lines, points and shapes that
-    are to be ignored have no mask.
-
-    Raises:
-        InputError: the file is broken, is of a photo of another size, all corners of its polygons lie between 0 and 1,
-            or a shape is malformed.
-    """
+    """The masks of a photo, numbered from 1 in the order of their first shapes; lines, points and shapes that are to be
+    ignored have no mask. Raises InputError if the file is broken, is of a photo of another size, all corners of its
+    polygons lie between 0 and 1, or a shape is malformed."""
     content = read_json(path, LabelmeFile)
     size = (content.imageWidth or width, content.imageHeight or height)
     if size != (width, height):

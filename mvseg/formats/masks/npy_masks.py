@@ -12,13 +12,9 @@ from mvseg.formats.masks.found_mask import FoundMask
 
 
 def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask]:
-    """The (height, width) uint16 labels of a photo, or its masks, numbered from 1, where the file holds a stack.
-
-    The masks of a stack are what is not 0, in whole numbers of any type, floats included.
-
-    Raises:
-        InputError: the file is no array of numbers, or has another size; a stack holds fractions or negative numbers.
-    """
+    """The (height, width) uint16 labels of a photo, or its masks, numbered from 1, where the file holds a stack: pixels
+    that are not 0, in whole numbers of any type, floats included. Raises InputError if the file is no array of numbers,
+    or has another size, or a stack holds fractions or negative numbers."""
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
     try:

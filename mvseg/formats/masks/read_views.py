@@ -24,15 +24,9 @@ from mvseg.scene import Scene
 
 
 def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
-    """The masks of each view in turn, in the frame of its photo: see `stack_views`.
-
-    At the end, warns (InputWarning) of entries without a mask, of numbers that are ignored, and of several categories
-    if none is wanted.
-
-    Raises:
-        InputError: a file is missing, broken, or of another size than its view; none of the entries has a mask; or a
-            wanted category is not there.
-    """
+    """The masks of each view in turn, in the frame of its photo, see `stack_views`. Warns (InputWarning) at the end of
+    entries without a mask, of ignored numbers, and of several categories if none is wanted. Raises InputError if a file
+    is missing, broken, or of another size than its view, no entry has a mask, or a wanted category is not there."""
     counts: Counter[str] = Counter()
     num_boxes = num_borders = 0
     entries: list[FoundMask] = []
@@ -68,10 +62,7 @@ def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> It
 
 def read_photo_masks(paths: Sequence[Path], kind: str, size: Sequence[int]) -> np.ndarray | list[FoundMask]:
     """The masks of one photo of this size (width, height): a label map (H, W) uint16, or a list; see `MaskFiles`.
-
-    Raises:
-        InputError: a file is missing, broken, or of another size.
-    """
+    Raises InputError if a file is missing, broken, or of another size."""
     width, height = size
     if not paths:
         return []

@@ -1,4 +1,4 @@
-"""What kind of masks a path holds, and which files belong to which photo."""
+"""Kinds of masks at a path, and their files for each photo."""
 
 from __future__ import annotations
 
@@ -55,14 +55,12 @@ class MaskFiles:
 
 
 def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
-    """The kind of masks that fits most photos of a scene, and its files.
+    """Find the kind of masks that fits most photos of a scene, and its files.
 
     Warns (InputWarning) where there is more than one kind, of photos without a file, and of files that fit a photo by
-    their base name only. The photos themselves and their copies are no masks, wherever they lie.
-
-    Raises:
-        InputError: there is nothing at the path, or nothing there fits a photo, or several files of each kind fit the
-            same one; the message says what is there.
+    their base name only. The photos themselves and their copies are no masks, wherever they lie. Raises InputError,
+    which says what is there, if there is nothing at the path, nothing fits a photo, or several files of each kind fit
+    the same one.
     """
     if masks.is_file() and masks.suffix.lower() == ".json":
         return MaskFiles(masks, "COCO", ((masks,),) * len(scene.views))
@@ -137,12 +135,7 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
 
 
 def _fit(names: dict[str, list[Path]], scene: PhotoSet, folder: Path, *, kind: str) -> Files:
-    """The files of each view.
-
-    Raises:
-        InputError: several files fit one view, and none has exactly its name (a folder of photos beside one of masks).
-            The message is a reason.
-    """
+    """The files of each view; InputError, with a reason, if several fit one view and none has exactly its name."""
     files: list[list[Path]] = [[] for _ in scene.views]
     stems, problem = [f"{name}.png" for name in names], None
     views: list[int | None] = [None] * len(stems)
@@ -166,8 +159,7 @@ def _fit(names: dict[str, list[Path]], scene: PhotoSet, folder: Path, *, kind: s
 
 
 def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> Files:
-    """Complete photos without a file: where each photo must have one, the reader will report it; elsewhere they have no
-    masks."""
+    """Add a name for each missing file of a kind that every photo must have, for the reader to report; else warn."""
     if kind in COMPLETE:
         ending = next(ending for ending, each in ENDINGS.items() if each == kind)
         return tuple(paths or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
@@ -178,11 +170,7 @@ def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> File
 
 
 def _name_kind(kind: str, files: Files) -> str:
-    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not.
-
-    Raises:
-        InputError: a file cannot be read, or is of another program.
-    """
+    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
     if kind == "YOLO" and has_tracks(path for paths in files for path in paths):
         return YOLO_TRACKS
     if kind != "JSON":
@@ -197,8 +185,7 @@ def _name_kind(kind: str, files: Files) -> str:
 
 
 def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:
-    """A folder that fits no photo may hold one COCO file, as exports of CVAT do, or one in each of its folders, as
-    Roboflow's (train, valid, test)."""
+    """A folder that fits no photo may hold one COCO file (CVAT), or one in each of its folders (Roboflow)."""
     jsons = [path for path in paths if path.suffix.lower() == ".json"]
     if len({path.name for path in jsons}) == 1:
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))

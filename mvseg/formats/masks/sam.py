@@ -12,11 +12,8 @@ from mvseg.formats.masks.found_mask import FoundMask
 
 
 def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
-    """The masks of a photo, numbered from 1 in the order of the file.
-
-    Raises:
-        InputError: the file is of another form, or a mask is broken or of another size.
-    """
+    """The masks of a photo, numbered from 1 in the order of the file. Raises InputError if it is of another form, or a
+    mask is broken or of another size."""
     content = load_json(path)
     entries = content.get("annotations") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

@@ -33,7 +33,6 @@ def stack_views(
         views: V times a label map (H, W) uint16 (0 = nothing, 65535 = ignore), or pairs of a number and a mask (H, W)
             bool, which may overlap; in the frame of the photo.
         scene: gives the lenses; None for masks of undistorted photos.
-        source: where the masks come from; the warning names it.
         num_views: V, if there is no scene.
 
     Returns:
@@ -42,7 +41,7 @@ def stack_views(
         (`SAME`), and of findings of `check_numbers` in label maps and of `mask_faults` in masks of a scene.
 
     Raises:
-        InputError: there are masks, and none has a pixel; or see `check_numbers`.
+        InputError: there are masks, and none has a pixel; or see `check_numbers`. Messages name `source`.
     """
     rows: list[tuple[int, Box, Tensor, int]] = []
     between, num_empty, num_twice = np.zeros(2, np.int64), 0, 0

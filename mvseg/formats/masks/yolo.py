@@ -25,11 +25,7 @@ YOLO_TRACKS = "YOLO tracks"  # a kind of masks: each line ends in a confidence a
 def has_tracks(paths: Iterable[Path]) -> bool:
     """Whether every line of all files ends in a confidence and the number of a track, as those of ultralytics' `track`
     with `save_conf` do: a number from 0 to 1, and a whole one from 1 that no other line of its file has. As a corner it
-    would be the photo's bottom edge, or below it.
-
-    Raises:
-        InputError: a file cannot be read.
-    """
+    would be the photo's bottom edge, or below it. Raises InputError if a file cannot be read."""
     is_there = False
     for path in paths:
         lines = [line.split() for line in read_text(path, "YOLO's masks", most=MAX_BYTES).splitlines() if line.strip()]
@@ -48,14 +44,9 @@ def _is_track(confidence: str, number: str) -> bool:
 
 
 def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str], tracks: bool = False) -> list[FoundMask]:
-    """The masks of a photo, numbered by their lines from 1; boxes (4 numbers) have no mask.
-
-    Classes without a name in `names` (see `read_class_names`) go by their numbers. Of `tracks`, the last two numbers of
-    each line are left out.
-
-    Raises:
-        InputError: the file cannot be read, a line is not as above, or a polygon leaves the photo by far.
-    """
+    """The masks of a photo, numbered by their lines from 1; boxes (4 numbers) have no mask. Classes without a name in
+    `names` (see `read_class_names`) go by their numbers. Of `tracks`, the last two numbers of each line are left out.
+    Raises InputError if the file cannot be read, a line is not as above, or a polygon leaves the photo by far."""
     masks = []
     for number, line in enumerate(read_text(path, "YOLO's masks", most=MAX_BYTES).splitlines(), start=1):
         if not line.strip():
@@ -89,11 +80,7 @@ def name_files(folder: Path) -> list[Path]:
 
 
 def read_class_names(folder: Path) -> dict[int, str]:
-    """{class number: name}; empty if there is no such file.
-
-    Raises:
-        InputError: a file of names cannot be read.
-    """
+    """{class number: name}; empty if there is no file of names. Raises InputError if one cannot be read."""
     path = next((path for path in name_files(folder) if path.is_file()), None)
     if path is None:
         return {}
