@@ -1,8 +1,8 @@
 """What surfaces correct in the ids: `python -m benchmarks.checked_ids --cache DIR [--real FOLDER ...]`
 
 For each scene: ARI and e_k of the ids found and of those that the surfaces correct
-(`mvseg.verification.checked_ids`), how many masks are moved, how many of the moved were right before and are right
-afterwards, and CPU seconds of matching, of surfaces and of the check. "degraded" and "true" are the masks of the
+(`mvseg.verification.choose`), how many masks are moved, how many of the moved were right before and are right
+afterwards, and CPU seconds of matching, and of surfaces and the check. "degraded" and "true" are the masks of the
 evaluation scenes, "pieces" those of `straps.py`, whose numbers of leaves do not depend on --leaves; "real" are those of
 the folders with `masks/` and `truth/`.
 """
@@ -31,12 +31,13 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
-from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.choose import Judges, choose_leaves, find_again
 
 KINDS_HERE = (*KINDS, "pieces")
 STRAPS = 8, 12  # leaves
@@ -91,15 +92,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
-    header = ("ARI", "then", "e_k", "then", "moved", "right", "then", "match s", "fit s", "check s")
+    header = ("ARI", "then", "e_k", "then", "moved", "right", "then", "match s", "check s")
     print(f"{'masks':26}" + "".join(f"{name:>9}" for name in header))
     for given in list_masks(args):
         times = [time.process_time()]
         matched = match_regions(given.regions, given.cameras).masks
         times.append(time.process_time())
-        surfaces = fit_surfaces(given.regions, matched.instance_ids, given.cameras)
-        times.append(time.process_time())
-        checked = check_ids(matched, surfaces, cameras=given.cameras)
+        judges = Judges(given.cameras, holds=True, cache=SurfaceCache())
+        again = find_again(matched, judges, MatchConfig())
+        checked = choose_leaves(matched, [each for each in (matched, again) if each is not None], judges).masks
         times.append(time.process_time())
         is_moved = (matched.instance_ids != checked.instance_ids).numpy()
         both = matched.instance_ids, checked.instance_ids

@@ -40,10 +40,11 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
+from mvseg.verification.candidates import Candidates, gather_candidates
 from mvseg.verification.choice import choose
-from mvseg.verification.choose import gather_candidates
+from mvseg.verification.choose import Judges
 from mvseg.verification.evidence import Drawn, draw_views, see
-from mvseg.verification.leaf_scores import FITTED, Candidates, LeafScores, matched_features, shows_features
+from mvseg.verification.leaf_scores import FITTED, LeafScores, matched_features, shows_features
 from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
@@ -77,12 +78,9 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
     truth = true_maps(folder, scene)
     found = find_leaves(detect_scene(Photos(scene), DetectConfig(image_size=size)), scene.cameras)
     table, matched = found.proposals, found.matched
-    candidates = gather_candidates(
-        [(masks, masks.regions.labels) for masks in matched],
-        scene.cameras,
-        table=table,
-        is_held=torch.zeros(len(matched[0]), dtype=torch.bool),
-    )
+    rows = [masks.proposal for masks in matched]
+    fit = Judges(scene.cameras).fit
+    candidates = gather_candidates(matched, rows, table=table, fit=fit, cameras=scene.cameras)
     drawn = draw_views(table.regions, candidates.surfaces, scene.cameras)
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]

@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
@@ -64,6 +64,7 @@ from mvseg.matching.view_graph import ViewGraph
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -72,8 +73,7 @@ from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
-from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.choose import choose_leaves
+from mvseg.verification.choose import Judges, choose_leaves, find_again
 from mvseg.verification.drawn_leaves import follow_drawn
 from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, ROUGH, SNAP
 from mvseg.verification.snap_edges import snap_masks
@@ -243,20 +243,19 @@ TRIALS = {"given": check_given, "simulated": check_simulated, "found": choose_fo
 
 
 def check_trial(name: str, regions: Regions, cameras: Cameras, truth: Iterable[np.ndarray]) -> Trial:
-    """Surfaces check the ids of given masks, and those that show two leaves are cut."""
+    """Surfaces check the ids of given masks."""
     masks = match_masks(Masks.of(regions), cameras).masks
-    surfaces = fit_surfaces(masks.regions, masks.instance_ids, cameras)
-    return Trial(f"check {name}", CHECKING, partial(check_anew, masks, surfaces, cameras), list(truth))
+    judges = Judges(cameras, holds=True, cache=SurfaceCache())
+    return Trial(f"check {name}", CHECKING, partial(check_anew, masks, judges), list(truth))
 
 
-def check_anew(masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Masks:
-    checked = check_ids(masks, surfaces, cameras=cameras, config=MatchConfig())
-    return checked.close_gaps()
+def check_anew(masks: Masks, judges: Judges) -> Masks:
+    again = find_again(masks, judges, MatchConfig())
+    return choose_leaves(masks, [masks] if again is None else [masks, again], judges).masks
 
 
 def choose_anew(plant: Plant) -> Masks:
-    sure, *more = plant.matched
-    leaves = choose_leaves(sure, plant.proposals, cameras=plant.scene.cameras, more=more)
+    leaves = choose_leaves(plant.proposals, plant.matched, Judges(plant.scene.cameras))
     return snap_masks(leaves.masks, plant.opened.photos)
 
 

@@ -28,6 +28,7 @@ COLUMNS = (  # that are tensors
     "classes",
     "origin",
     "is_linked",
+    "proposal",
 )
 
 
@@ -54,6 +55,7 @@ class Masks:
         classes: (D,) int64; masks of different classes are never matched.
         origin: (D,) int64, of `Origin`.
         is_linked: (D,) bool, the user says which other masks show its instance, or do not.
+        proposal: (D,) int64, its row among the proposals of its plant; below 0: edits or other views made it.
 
     Raises:
         InputError: columns of other lengths than there are regions.
@@ -66,6 +68,7 @@ class Masks:
     classes: Tensor
     origin: Tensor
     is_linked: Tensor
+    proposal: Tensor
 
     def __repr__(self) -> str:
         return f"Masks({len(self)} in {self.regions.num_views} views, of {self.num_instances} instances)"
@@ -85,7 +88,7 @@ class Masks:
         classes: Tensor | None = None,
         origin: Origin = Origin.GIVEN,
     ) -> Masks:
-        """The table of these regions; by default they are matched to nothing, unscored, and of class 1."""
+        """The table of these regions; by default they are matched to nothing, unscored, of class 1, and proposals."""
         count, device = len(regions), regions.device
         integer = torch.ones(count, dtype=torch.int64, device=device)
         return Masks(
@@ -96,6 +99,7 @@ class Masks:
             classes=integer if classes is None else classes,
             origin=int(origin) * integer,
             is_linked=integer < 0,
+            proposal=torch.arange(count, device=device),
         )
 
     def __len__(self) -> int:

@@ -50,7 +50,7 @@ def describe(result: Result) -> dict[str, Any]:
         "surfaces": _attributes(result.surfaces, surfaces),
         "voxels": _attributes(result.voxels, ("origin", "voxel_size", "votes")),
         "traits": None if result.traits is None else _describe_traits(result.traits),
-        "outcome": [result.num_moved, result.fates, result.corrections and result.corrections.edits],
+        "outcome": [result.fates, result.corrections and result.corrections.edits],
     }
 
 

@@ -16,7 +16,7 @@ from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import detect, leave_autocast, run_heads
 from mvseg.detectors.small import SMALL_ARCHITECTURES
 from mvseg.masks import Masks
-from mvseg.verification.choose import Leaves
+from mvseg.verification.choose import Judges, Leaves
 from other_device import other_device
 from synthetic import arc_positions, cameras_at
 from tiny_training import build_tiny
@@ -136,9 +136,9 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
 
-    def choose(matched: Masks, proposals: Masks, **given: Any) -> Leaves:
-        assert {each.device.type for each in (given["cameras"].K, matched.view_index, proposals.view_index)} == {"cpu"}
-        return Leaves(proposals, {}, {}, ())
+    def choose(proposals: Masks, matched: list[Masks], judges: Judges) -> Leaves:
+        assert {each.device.type for each in (judges.cameras.K, matched[0].view_index, proposals.view_index)} == {"cpu"}
+        return Leaves.of(proposals)
 
     monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
     results = wrapped(photos, cameras=CAMERAS)

@@ -18,12 +18,11 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_regions
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
-from mvseg.verification.checked_ids import check_ids
+from verified import verify_ids
 
 LEAST_ARI = {"basil-0729": 1.0, "basil-dense": 0.93, "maize-series/D54.9": 1.0}  # the second measured: 0.974
 
@@ -40,8 +39,7 @@ def read(folder: Path) -> Given:
 
 def ids_with_and_without(cameras: Cameras, regions: Regions) -> tuple[Tensor, Tensor]:
     matched = match_regions(regions, cameras).masks
-    surfaces = fit_surfaces(regions, matched.instance_ids, cameras)
-    return check_ids(matched, surfaces, cameras=cameras).instance_ids, matched.instance_ids
+    return verify_ids(matched, cameras=cameras).instance_ids, matched.instance_ids
 
 
 @pytest.mark.slow

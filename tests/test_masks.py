@@ -114,5 +114,5 @@ def test_new_pixels_keep_all_else() -> None:
 
 
 def test_columns_have_a_row_for_every_region() -> None:
-    with pytest.raises(InputError, match=r"5 regions with columns of \[4, 5, 5, 5, 5, 5\] rows"):
+    with pytest.raises(InputError, match=r"5 regions with columns of \[4, 5, 5, 5, 5, 5, 5\] rows"):
         replace(table(), instance_ids=torch.ones(4, dtype=torch.int64))

@@ -36,8 +36,7 @@ from mvseg.formats.photos import Photos
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.scene import View
-from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.choose import choose_leaves
+from mvseg.verification.choose import Judges, choose_leaves
 from mvseg.verification.snap_edges import snap_masks
 from other_device import other_device
 from synthetic import ball_scene
@@ -97,9 +96,8 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).close_gaps().count_sure_views(), True),
     "LeafSurface": (lambda r, c, i: surfaces()[1].project(c)[0], True),
     "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),
-    "check_ids": (lambda r, c, i: check_ids(masks_of(r, i), surfaces(), cameras=c).instance_ids, True),
     "choose_leaves": (
-        lambda r, c, i: choose_leaves(found := detected(r, i), found, cameras=c).masks.instance_ids, False
+        lambda r, c, i: choose_leaves(found := detected(r, i), [found], Judges(c.to("cpu"))).masks.instance_ids, False
     ),
     "snap_masks": (lambda r, c, i: snap_masks(detected(r, i), grey_photos(c)).instance_ids, False),
     "list_mask_questions": (lambda r, c, i: len(list_mask_questions(masks_of(r, i), surfaces(), cameras=c)), False),
@@ -132,7 +130,7 @@ def test_the_answer_is_the_same_there(name: str) -> None:
 
 
 def test_every_public_name_is_looked_at() -> None:
-    inner = {"match_masks", "check_ids", "choose_leaves", "snap_masks", "list_mask_questions"}  # of stages, not public
+    inner = {"match_masks", "choose_leaves", "snap_masks", "list_mask_questions"}  # of stages, not public
     assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
 
 

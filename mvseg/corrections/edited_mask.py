@@ -67,17 +67,20 @@ def touch(one: Crop, other: Crop) -> bool:
 
 def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
     """The table of the masks that are left. Those drawn where none was have the commonest class; what was drawn has no
-    score."""
+    score. Masks that edits made, or changed, have proposals of their own, from -1 downwards."""
     if not made:
         return Masks.of(masks.regions).select(torch.zeros(0, dtype=torch.int64))
     rows = torch.tensor([mask.row for mask in made])
     origin = torch.tensor([mask.origin for mask in made])
     classes, scores, labels = torch.ones_like(rows), torch.full((len(made),), torch.nan), torch.zeros_like(rows)
+    proposal = -1 - torch.arange(len(made))
     if len(masks):
         is_new, chosen = rows < 0, rows.clamp(min=0)
         classes = torch.where(is_new, masks.classes.mode()[0], masks.classes[chosen])
         scores = torch.where(origin == Origin.CORRECTED, torch.nan, masks.detection_scores[chosen])
         labels = torch.where(is_new, 0, masks.regions.labels[chosen])
+        is_same = torch.tensor([_is_untouched(mask, masks) for mask in made])
+        proposal = torch.where(is_same, masks.proposal[chosen], proposal)
     regions = stack_regions(
         [mask.view for mask in made],
         [mask.crop.box for mask in made],
@@ -85,4 +88,11 @@ def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
         labels=labels.tolist(),
         num_views=masks.regions.num_views,
     )
-    return replace(Masks.of(regions, classes=classes, detection_scores=scores), origin=origin)
+    return replace(Masks.of(regions, classes=classes, detection_scores=scores), origin=origin, proposal=proposal)
+
+
+def _is_untouched(mask: EditedMask, masks: Masks) -> bool:
+    if mask.key[0] > 0:
+        return False
+    crop = masks.regions.placed(mask.row)
+    return mask.crop.box == crop.box and torch.equal(mask.crop.pixels, crop.pixels)

@@ -16,7 +16,6 @@ from torch import Tensor
 
 from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.numbers import EDITS
-from mvseg.corrections.unchanged_leaves import ids_before
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
@@ -26,7 +25,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 
-def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Corrected:
+def link_halves(corrected: Corrected, ids: Tensor, cameras: Cameras) -> Corrected:
     """The masks as edits leave them, with the links that follow between halves of a leaf.
 
     A link that joins masks of two instances is about all of their masks where several photos show both, and one surface
@@ -35,7 +34,7 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
 
     Args:
         corrected: D masks and their links.
-        before: the masks before the edits, on the CPU, with the ids that the user saw.
+        ids: (D,) int64, the leaves that they showed before the edits.
 
     Returns:
         The same with more links; a link that would contradict those of the user is left out.
@@ -43,7 +42,6 @@ def link_halves(corrected: Corrected, before: Masks, cameras: Cameras) -> Correc
     masks, links = corrected.masks, corrected.links
     if not len(links.must):
         return corrected
-    ids = ids_before(masks, before)
     is_linked = masks.is_linked
     for one, other in sorted({(min(pair), max(pair)) for pair in ids[links.must].tolist()}):
         halves = _in_one_photo(masks, ids == one, ids == other) if 0 < one < other else []

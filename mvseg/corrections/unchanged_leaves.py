@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mvseg.corrections.corrected import Corrected
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.regions import Regions
 
 
@@ -20,26 +20,13 @@ def name_regions(regions: Regions) -> list[str]:
     return [f"{view} {box} {digest}" for (view, box), digest in zip(places, pixels, strict=True)]
 
 
-def ids_before(masks: Masks, before: Masks) -> Tensor:
-    """(D,) int64, the ids that the user saw: those of the same masks before edits; -1 for those that were not there."""
-    known = dict(zip(name_regions(before.regions), before.instance_ids.tolist(), strict=True))
-    return torch.tensor([known.get(name, -1) for name in name_regions(masks.regions)], dtype=torch.int64)
-
-
-def find_pairs(masks: Masks, pairs: Tensor, others: Masks) -> Tensor:
-    """(Q', 2) int64, pairs (Q, 2) of rows of a table as rows of another one that has both masks."""
-    names, row_of = name_regions(masks.regions), {name: row for row, name in enumerate(name_regions(others.regions))}
-    rows = [[row_of.get(names[row], -1) for row in pair] for pair in pairs.tolist()]
-    return torch.tensor([pair for pair in rows if min(pair) >= 0], dtype=torch.int64).reshape(-1, 2)
-
-
 def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
     """Find the leaves that edits mention but do not change: none of their masks is gone, changed, kept apart from
     another one, or linked to one of another leaf, and the leaf is not rejected.
 
     Args:
         corrected: D masks and their links.
-        ids: (D,) int64, their `ids_before`.
+        ids: (D,) int64, the leaves that they showed before the edits.
         before: the masks before the edits, on the CPU, with the ids that the user saw.
 
     Returns:
@@ -54,7 +41,6 @@ def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor
         cannot[cannot[:, 0] == cannot[:, 1]].flatten(),
         ids[[each.row for each in corrected.everywhere if each.rejects]],
         (remaining != all_of).nonzero()[:, 0],
-        before.instance_ids[before.origin != Origin.DETECTED],  # the views did not choose these
     )
     named = ids[corrected.masks.is_corrected | corrected.masks.is_linked]
     leaves = named[named > 0].unique()

@@ -21,7 +21,7 @@ from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
-from mvseg.verification.choose import Leaves, choose_leaves
+from mvseg.verification.choose import Judges, Leaves, choose_leaves
 from mvseg.verification.leaf_scores import Rating, rate_pass
 
 
@@ -148,13 +148,9 @@ def find_leaves(
             matched.append(detected.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
     sides = cameras.sizes if detected.boxes is None else detected.boxes[:, 2:] - detected.boxes[:, :2]
     pixel = int(sides.max()) / detected.longest
-    nothing = Leaves(matched[0], {}, {}, ())
-    result = PassResult((detected,), nothing, proposals, tuple(matched), detected.sure.report, pixel)
-    return _choose(result, cameras, config=config, cache=cache) if config.verify else result
-
-
-def _choose(result: PassResult, cameras: Cameras, *, config: DetectConfig, cache: SurfaceCache | None) -> PassResult:
-    (first, *more), least = result.matched, config.min_probability
-    with timed("choose"):
-        leaves = choose_leaves(first, result.proposals, cameras=cameras, more=more, min_probability=least, cache=cache)
-    return replace(result, leaves=leaves)
+    leaves = Leaves.of(matched[0])
+    if config.verify:
+        judges = Judges(cameras.to("cpu"), min_probability=config.min_probability, cache=cache)
+        with timed("choose"):
+            leaves = choose_leaves(proposals, matched, judges)
+    return PassResult((detected,), leaves, proposals, tuple(matched), detected.sure.report, pixel)

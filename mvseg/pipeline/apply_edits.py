@@ -11,15 +11,14 @@ from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
-from mvseg.corrections.unchanged_leaves import find_pairs, ids_before, leave_joined, unchanged_leaves
+from mvseg.corrections.unchanged_leaves import leave_joined, unchanged_leaves
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.matching.match import match_masks
 from mvseg.pipeline.plant import Plant
-from mvseg.results.result import Instances
 from mvseg.system.running import timed
-from mvseg.verification.choose import choose_leaves
+from mvseg.verification.choose import Edited
 from mvseg.verification.drawn_leaves import follow_drawn
 
 
@@ -31,67 +30,41 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     """
     if corrections is None or not corrections.edits:
         return plant
-    opened, cameras, config = plant.opened, plant.scene.cameras, plant.opened.config
+    opened, cameras, editable = plant.opened, plant.scene.cameras, plant.editable.to("cpu")
     with timed("correct"):
-        editable, before = plant.editable, plant.masks.to("cpu")
         corrected = apply(corrections, editable, plant.scene)
+        before = plant.ids_of(corrected.masks)
         corrected = link_halves(corrected, before, cameras.to("cpu"))
-        previous = torch.full_like(corrected.last_edits, -1)
-        if opened.is_chosen:
-            previous = ids_before(corrected.masks, before)
-        previous = previous.where(torch.isin(previous, unchanged_leaves(corrected, previous, before)), -1)
+        stays = torch.isin(before, unchanged_leaves(corrected, before, plant.masks.to("cpu")))
     with timed("match"):
-        matched, previous = _match_anew(plant, corrected, previous)
-    masks, corrected = apply_everywhere(corrected, matched.masks)
+        edited, stays = _match_anew(plant, corrected, before.where(stays, -1))
+    masks, done = apply_everywhere(corrected, edited.masks)
     if len(editable) and not len(masks):
         warn(Finding("no_leaf_left"))
-    edited = replace(
-        matched, instances=Instances(), rejected=(), edits=corrected.fates, refused=corrected.refused
-    ).with_masks(masks)
-    if opened.is_chosen or config.reconstruct is not None:
+    if not opened.holds or opened.config.reconstruct is not None:
         with timed("follow"):
             photos = opened.photos if opened.photos.exist else None
             colors = plant.leaf_colors if photos is not None and plant.matching.num_instances else None
-            masks, starts = follow_drawn(
-                edited.masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces
-            )
-            edited = replace(edited, instances=Instances(starts=starts)).with_masks(masks)
-    if not opened.is_chosen:
-        return edited
-    with timed("choose"):
-        masks = edited.masks.to("cpu")
-        leaves = choose_leaves(
-            masks,
-            plant.proposals,
-            cameras=cameras,
-            more=plant.matched,
-            removed=_removed_masks(editable, masks),
-            previous=ids_before(masks, replace(corrected.masks, instance_ids=previous)),
-            apart=find_pairs(corrected.masks, corrected.links.cannot, masks),
-            drawn=plant.drawn,
-            min_probability=config.detect.min_probability,
-            cache=opened.surfaces,
-        )
-    return edited.with_leaves(leaves)
+            masks, _ = follow_drawn(masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces)
+    said = _gather_said(plant, corrected, stays, masks)
+    return replace(edited, edits=done.fates, refused=done.refused).choose(said, drawn=plant.drawn)
 
 
 def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[Plant, Tensor]:
-    """Match the edited masks anew, but for those of leaves that stay: these keep their ids.
-
-    Where the views choose, and the user speaks of such leaves only, nothing is matched, and what matching said stays.
+    """Match the edited masks anew, but for those of leaves that stay: these keep their ids. Where the user speaks of
+    such leaves only, nothing is matched, and what matching said stays.
 
     Args:
         corrected: D masks and their links.
-        previous: (D,) int64 on the CPU, the leaves that stay as they were seen; -1 for all other masks.
+        previous: (D,) int64 on the CPU, ids of the leaves that stay as they were seen; -1 for all other masks.
 
     Returns:
         What is known with the D masks, and `previous` without the leaves that other masks join, see `leave_joined`.
     """
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
-    if plant.opened.is_chosen and not rejects and not bool((is_held & (previous < 1)).any()):
-        ids_only = replace(masks, instance_ids=previous).close_gaps()
-        return replace(plant, matching=plant.matching.with_masks(ids_only)), previous
+    if not rejects and not bool((is_held & (previous < 1)).any()):
+        return replace(plant, matching=plant.matching.with_masks(replace(masks, instance_ids=previous))), previous
     is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else the user's masks tell it better
     matching = match_masks(
         masks,
@@ -104,10 +77,18 @@ def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[P
     previous = leave_joined(previous, matched.instance_ids, is_held)
     ids = torch.where(previous > 0, previous + matched.num_instances, matched.instance_ids)
     disagreement = plant.opened.find_disagreement(matching)
-    matching = matching.with_masks(replace(matched, instance_ids=ids).close_gaps())
+    matching = matching.with_masks(replace(matched, instance_ids=ids))
     return replace(plant, matching=matching, disagreement=disagreement), previous
 
 
-def _removed_masks(before: Masks, after: Masks) -> Masks:
-    is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
-    return before.select(~torch.isin(before.regions.labels, after.regions.labels.cpu()[is_left]))
+def _gather_said(plant: Plant, corrected: Corrected, previous: Tensor, masks: Masks) -> Edited:
+    """What edits say of the masks that are left, and of the proposals that are gone."""
+    before, names = corrected.masks, corrected.masks.proposal
+    row_of = {name: row for row, name in enumerate(masks.proposal.tolist())}
+    pairs = [[row_of.get(name, -1) for name in pair] for pair in names[corrected.links.cannot].tolist()]
+    apart = torch.tensor([pair for pair in pairs if min(pair) >= 0], dtype=torch.int64).reshape(-1, 2)
+    stays = torch.isin(masks.proposal, names[previous > 0])
+    changed = plant.ids_of(before)[(before.is_corrected | before.is_linked) & (previous < 1)].tolist()
+    keys = tuple(None if leaf in changed else plant.keys.get(leaf) for leaf in plant.ids_of(masks).tolist())
+    gone = plant.editable.proposal.cpu()
+    return Edited(masks, keys, stays, gone=gone[~torch.isin(gone, masks.proposal)], apart=apart)

@@ -28,7 +28,8 @@ from mvseg.verification.choose import RejectedCandidate
 
 MOST_BYTES = 1 << 29  # limit: of the file, inflated: a stranger's file must not fill the memory
 FIELDS = (
-    "matching", "instances", "proposals", "matched", "image_size", "boxes", "rejected", "agreement", "disagreement",
+    "matching", "instances", "proposals", "matched", "image_size", "boxes", "rejected", "agreement", "keys",
+    "disagreement",
 )  # fmt: skip
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [

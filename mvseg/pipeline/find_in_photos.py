@@ -20,7 +20,7 @@ from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.matching.result import Matching
 from mvseg.pipeline.open_scene import Opened
-from mvseg.pipeline.plant import Plant, whole_photos
+from mvseg.pipeline.plant import Plant, hold_matched, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.results.result import Instances
 from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
@@ -42,7 +42,7 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
         InputError: see `detect_scene`.
     """
     detect = opened.config.detect
-    if detect.image_size is not None or not opened.is_chosen:
+    if detect.image_size is not None or opened.holds:
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
     few, views = select_judges(opened)
     first = run_pass(few, detect, cache=cache)
@@ -141,6 +141,9 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
     if not len(detected.sure):
         warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
     matching = Matching(result.matched[0], result.report)
+    boxes = whole_photos(opened.scene) if detected.boxes is None else detected.boxes
+    if opened.holds:
+        return hold_matched(opened, matching, image_size=detected.longest, boxes=boxes)
     plant = Plant(
         opened=opened,
         matching=matching,
@@ -148,8 +151,8 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
         proposals=result.proposals,
         matched=result.matched,
         image_size=detected.longest,
-        boxes=whole_photos(opened.scene) if detected.boxes is None else detected.boxes,
+        boxes=boxes,
         rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return plant.with_leaves(result.leaves) if opened.is_chosen else plant
+    return plant.with_leaves(result.leaves)

@@ -49,11 +49,8 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
     Args:
         same_segmenter: the surfaces before edits, see `fit_surfaces`; None: there are no edits.
     """
-    opened, num_moved = plant.opened, None
-    if opened.is_chosen:
-        plant = complete_masks(plant)
-    if opened.is_checked:
-        plant, num_moved = verify_ids(plant, fit_leaves(plant, same_segmenter))
+    opened = plant.opened
+    plant = plant if opened.holds else complete_masks(plant)
     shapes = opened.config.reconstruct
     surfaces = None if shapes is None or shapes.shape == "voxels" else fit_leaves(plant, same_segmenter)
     shown = surfaces or plant.instances.starts
@@ -68,7 +65,6 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         photos=opened.photos,
         rejected=rejected,
         mask_kind=opened.mask_kind,
-        num_moved=num_moved,
         views_left_out=opened.views_left_out,
         fates=fates,
         learned=plant.learned,
@@ -84,18 +80,6 @@ def complete_masks(plant: Plant) -> Plant:
     with timed("snap"):
         missing = find_missing_parts(masks, plant.instances.starts, photos, cameras=plant.scene.cameras)
         return plant.with_masks(snap_masks(masks, photos, missing=missing, cache=plant.opened.snapped))
-
-
-def verify_ids(plant: Plant, surfaces: Mapping[int, LeafSurface]) -> tuple[Plant, int]:
-    """Let the surfaces check the ids, see `check_ids`; and the number of masks that moved."""
-    from mvseg.verification.checked_ids import check_ids
-
-    opened = plant.opened
-    with timed("check_ids"):
-        checked = check_ids(
-            plant.masks, surfaces, cameras=plant.scene.cameras, config=opened.config.match, cache=opened.surfaces
-        )
-    return plant.with_masks(checked), int((plant.masks.instance_ids != checked.instance_ids).sum())
 
 
 def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -> dict[int, LeafSurface]:
@@ -116,7 +100,7 @@ def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -
 def _find_missing(plant: Plant, result: Result) -> Finding | None:
     from mvseg.verification.unexplained import find_missing
 
-    if not plant.opened.is_chosen or (plant.edits and not len(result.masks)):  # the user says that there is none
+    if plant.opened.holds or (plant.edits and not len(result.masks)):  # the user says that there is none
         return None
     return find_missing(result.masks, plant.opened.photos, sure_score=DETECTION.sure_score)
 

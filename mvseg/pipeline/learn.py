@@ -98,7 +98,7 @@ def _count_rounds(plant: Plant) -> int:
     """Number of rounds to try. With "auto", none where the detector knows the species: the views agree about its
     leaves, most of these score well, and its own size is the best one."""
     opened = plant.opened
-    if not opened.is_chosen or opened.config.learn == "off":
+    if opened.holds or opened.config.learn == "off":
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn

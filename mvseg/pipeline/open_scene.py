@@ -30,6 +30,7 @@ from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
 from mvseg.traits.up import place_scene
+from mvseg.verification.choose import Judges
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,15 +69,21 @@ class Opened:
         return find_disagreement(matching, self.names, is_detected=self.given is None)
 
     @property
-    def is_checked(self) -> bool:
-        """Whether surfaces check the ids: those of masks that the views do not choose."""
-        shapes = self.config.reconstruct
-        return shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not self.is_chosen
+    def holds(self) -> bool:
+        """Whether masks are held to what they were matched to: given ones, and those that the views may not choose."""
+        return self.given is not None or not self.config.detect.verify
 
     @property
-    def is_chosen(self) -> bool:
-        """Whether the views choose the masks, of all that a detector proposes."""
-        return self.given is None and self.config.detect.verify
+    def judges(self) -> Judges:
+        """Means to judge candidates by."""
+        shapes, detect = self.config.reconstruct, self.config.detect
+        return Judges(
+            cameras=self.scene.cameras.to("cpu"),
+            has_surfaces=not self.holds or (shapes is not None and shapes.check_ids and shapes.shape != "voxels"),
+            holds=self.holds,
+            min_probability=detect.min_probability,
+            cache=self.surfaces,
+        )
 
 
 def open_scene(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -20,7 +21,8 @@ from mvseg.pipeline.open_scene import Opened
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
-from mvseg.verification.choose import add_beside
+from mvseg.verification.candidates import Key
+from mvseg.verification.choose import Edited, add_beside, choose_leaves, find_again
 from mvseg.verification.evidence import Drawn, draw_views
 from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
 from mvseg.verification.leaf_scores import Rating, rate_pass
@@ -45,6 +47,7 @@ class Plant:
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
         rejected: candidates that the views did not choose.
         agreement: of the views about the leaves, see `Leaves`; NaN where they do not choose.
+        keys: {instance id: key of the candidate that it was}.
         edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
         learned: weights that the detector learned from this plant.
@@ -60,6 +63,7 @@ class Plant:
     boxes: Tensor
     rejected: tuple[RejectedCandidate, ...]
     agreement: float = float("nan")
+    keys: Mapping[int, Key] = field(default_factory=dict)
     edits: tuple[Fate, ...] = ()
     refused: tuple[RejectedPixel, ...] = ()
     learned: Learned = NOTHING_LEARNED
@@ -96,9 +100,13 @@ class Plant:
     def editable(self) -> Masks:
         """Masks that the user sees and edits: given masks, or accepted ones and, beside them, sure detections that show
         something else."""
-        if self.opened.is_chosen:
-            return add_beside(self.masks, self.matched[0], self.scene.cameras)
-        return self.masks if self.opened.given is None else self.proposals
+        return self.masks if self.opened.holds else add_beside(self.masks, self.matched[0], self.scene.cameras)
+
+    def ids_of(self, masks: Masks) -> Tensor:
+        """(D,) int64, the leaf that each mask of a later table showed here: -1 for none, and for masks made since."""
+        ids = torch.full((len(self.proposals) + 1,), -1)
+        ids[self.masks.proposal.cpu()] = self.masks.instance_ids.cpu()
+        return ids[masks.proposal.cpu().clamp(min=-1)]  # the last one is -1
 
     @cached_property
     def drawn(self) -> tuple[Drawn, ...]:
@@ -121,31 +129,48 @@ class Plant:
         )
 
     def with_leaves(self, leaves: Leaves) -> Plant:
-        """The same with the leaves that the views chose."""
+        """The same with the leaves that were chosen."""
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
         chosen = replace(self, instances=instances, rejected=leaves.rejected, agreement=leaves.agreement)
-        return chosen.with_masks(leaves.masks)
+        return replace(chosen, keys=leaves.keys).with_masks(leaves.masks)
+
+    def choose(self, edited: Edited | None = None, *, drawn: Sequence[Drawn] = ()) -> Plant:
+        """Choose leaves, see `choose_leaves`."""
+        with timed("choose"):
+            leaves = choose_leaves(self.proposals, self.matched, self.opened.judges, edited=edited, drawn=drawn)
+        return self.with_leaves(leaves)
 
 
 def match_given(opened: Opened) -> Plant:
-    """The same id for given masks of the same leaf, see `match_masks`."""
+    """The same id for given masks of the same leaf, see `match_masks`, and `choose_leaves`."""
     given = opened.given
     assert given is not None, "expected a scene with masks"
     with timed("match"):
         matching = match_masks(given, opened.scene.cameras, config=opened.config.match)
-    boxes = whole_photos(opened.scene)
+    return hold_matched(opened, matching)
+
+
+def hold_matched(
+    opened: Opened, matching: Matching, *, image_size: int | None = None, boxes: Tensor | None = None
+) -> Plant:
+    """A plant of masks that are held to what they were matched to, unless surfaces say otherwise."""
+    boxes = whole_photos(opened.scene) if boxes is None else boxes
+    masks = matching.masks.to("cpu")
+    masks = replace(masks, proposal=torch.arange(len(masks)))
+    with timed("choose"):
+        again = find_again(masks, opened.judges, opened.config.match)
     plant = Plant(
         opened=opened,
         matching=matching,
         instances=Instances(),
-        proposals=given.to("cpu"),
-        matched=(matching.masks,),
-        image_size=int(boxes.max()),
+        proposals=masks,
+        matched=(masks,) if again is None else (masks, again),
+        image_size=int(boxes.max()) if image_size is None else image_size,
         boxes=boxes,
         rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
-    return plant
+    return plant.choose()
 
 
 def whole_photos(scene: Scene) -> Tensor:

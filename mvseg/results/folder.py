@@ -108,8 +108,6 @@ def describe_result(result: Result) -> dict[str, Any]:
     if result.fates:
         record["corrections"] = [asdict(each) for each in result.fates]
     record["counts"] = {"regions": len(result.regions), "instances": result.matching.num_instances}
-    if result.num_moved is not None:
-        record["counts"]["moved"] = result.num_moved
     return record | {"seconds": {stage: round(wall, 3) for stage, wall in result.seconds.items()}}
 
 

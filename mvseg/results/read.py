@@ -158,7 +158,6 @@ def load_result(folder: Path | str) -> Result:
         learned=load_learned(folder, run),
         seconds=run.seconds,
         mask_kind=run.mask_kind or "",
-        num_moved=run.counts.get("moved"),
         views_left_out=run.views.get("left_out", ()),
         corrections=parse_corrections(edits, None if source is None else Path(source)) if run.edits else None,
         fates=run.corrections,

@@ -100,7 +100,6 @@ class Result:
         findings: of the run, on its input and the result, the gravest first.
         seconds: {stage: wall time}.
         mask_kind: source of the masks ("COCO", "label images", ...); "" where a detector found them.
-        num_moved: number of masks that surfaces moved to another instance, see `check_ids`; None without it.
         views_left_out: names of the scene's other views, see `RunConfig.views`.
         corrections: of the user; None where there were none.
         fates: the outcome of each of them.
@@ -118,7 +117,6 @@ class Result:
     findings: tuple[Finding, ...] = ()
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""
-    num_moved: int | None = None
     views_left_out: tuple[str, ...] = ()
     corrections: Corrections | None = None
     fates: tuple[Fate, ...] = ()

@@ -89,7 +89,7 @@ class OpenResult:
     @property
     def can_learn(self) -> bool:
         """Whether there is a detector, and views choose what it finds."""
-        return self.opened.is_chosen
+        return not self.opened.holds
 
     @property
     def learner(self) -> OpenResult | None:
@@ -138,7 +138,7 @@ class OpenResult:
         news["told"] = tell_drawn(result, new=new, angles=measure_angles(result))
         self._page_result = result, pictures
         yield Update(news, outcomes, vanished + messages)
-        if self.opened.is_chosen:
+        if not self.opened.holds:
             self._now[0].draw_ahead()
 
     @cached_property

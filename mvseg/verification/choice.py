@@ -1,4 +1,4 @@
-"""The likeliest leaf first: each takes its masks, and the others are judged by what is left."""
+"""Assign masks to leaves: the one place that decides."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from torch import Tensor
 
-from mvseg.masks import Masks
+from mvseg.masks import Masks, Origin
+from mvseg.verification.candidates import Candidates
 from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, see
 from mvseg.verification.leaf_scores import (
     FITTED,
-    Candidates,
     LeafScores,
     best_masks,
     leaf_chances,
@@ -66,72 +65,46 @@ class Choice:
 
 
 @dataclass(frozen=True, eq=False)
-class Statements:
-    """Edits of the user about D masks.
+class Rows:
+    """Terms of D masks and K candidates that hold whatever surfaces and scores say.
 
     Attributes:
-        is_held: (D,) bool, whether an edit is about the mask.
-        is_sure: (D,) bool, whether an edit says that it shows a leaf.
-        leaf: (D,) int64, its leaf before the edits, if that leaf stays as it was; -1 elsewhere.
+        shows: (D, K) log odds of the user: plus infinity where the mask shows the candidate, minus where it does not.
+        apart: (Q, 2) int64, masks that show different leaves, as the user says: of each pair, a candidate can have the
+            likelier one alone.
+        held: (D,) int64, the candidate that each given mask was matched to; -1 for none.
+        hold: (D,) q from which another leaf takes a mask from the one that it is held to.
     """
 
-    is_held: Bools
-    is_sure: Bools
-    leaf: Ints
+    shows: Floats
+    apart: Ints
+    held: Ints
+    hold: Floats
 
     @staticmethod
-    def nothing(num_masks: int) -> Statements:
-        """Statements about no mask."""
-        return Statements(np.zeros(num_masks, bool), np.zeros(num_masks, bool), np.full(num_masks, -1))
-
-    @staticmethod
-    def of(num_masks: int, rows: Ints, *, is_held: Tensor, is_sure: Tensor, leaf: Tensor) -> Statements:
-        """Statements about some rows of a table."""
-        said = Statements.nothing(num_masks)
-        said.is_held[rows], said.is_sure[rows], said.leaf[rows] = is_held, is_sure, leaf
-        return said
+    def none(num_masks: int, num_candidates: int) -> Rows:
+        shows, apart = np.zeros((num_masks, num_candidates)), np.zeros((0, 2), np.int64)
+        return Rows(shows, apart, np.full(num_masks, -1), np.zeros(num_masks))
 
     @property
-    def is_of_others(self) -> Bools:
-        """(D,) whether an edit says that the mask shows none of the leaves that edits changed."""
-        return self.is_held & (~self.is_sure | (self.leaf > 0))
-
-    def unchanged_candidates(self, q: Floats, is_taken: Bools) -> Ints:
-        """Candidate of each mask (D,) of a leaf that stays and that an edit is about, -1 for the others: the one that
-        all masks of the leaf show best by q (D, K). Accepted candidates (K,) first, then all."""
-        of_mask = np.full(len(q), -1)
-        leaves = np.unique(self.leaf[self.is_held & (self.leaf > 0)])
-        if len(leaves):
-            sums = np.stack([q[self.leaf == each].sum(0) for each in leaves])
-            sums += len(q) * (is_taken & (sums > 0))
-            for row, candidate in zip(*linear_sum_assignment(sums, maximize=True), strict=True):
-                of_mask[self.is_held & (self.leaf == leaves[row])] = candidate
-        return of_mask
-
-
-@dataclass(frozen=True, eq=False)
-class _Ranked:
-    """One round of the choice.
-
-    Attributes:
-        q: (D, K) how likely each mask shows each candidate.
-        steps: of all candidates, the likeliest first.
-        leaves: (L,) indices of the candidates that are leaves, the likeliest first.
-        stays: (L,) bool, a leaf because the user says so, whatever its chance.
-        certain: (D, L) bool, a mask that shows a leaf because the user says so.
-    """
-
-    q: Floats
-    steps: tuple[Step, ...]
-    leaves: Ints
-    stays: Bools
-    certain: Bools
+    def certain(self) -> Bools:
+        """(D, K) whether the mask shows the candidate for certain."""
+        return np.isposinf(self.shows)
 
     @property
-    def chances(self) -> Floats:
-        """(L,) P of the leaves; 1 where the user says so."""
-        chance = {each.candidate: each.chance for each in self.steps}
-        return np.where(self.stays, 1.0, [chance[leaf] for leaf in self.leaves.tolist()])
+    def is_leaf(self) -> Bools:
+        """(K,) whether the candidate is a leaf for certain."""
+        return np.asarray(self.certain.any(0), bool)
+
+    def add_to(self, q: Floats, is_made: Bools) -> Floats:
+        """(D, K) q with these terms; a mask that shows one candidate for certain shows no other. Of candidates that
+        edits did not make (`is_made` (K,)), certain masks change nothing yet: these leaves stay as they were."""
+        certain = self.certain & is_made
+        q = np.where(np.isneginf(self.shows) | certain.any(1, keepdims=True), 0.0, q)
+        for one, other in self.apart:
+            odds = q + certain
+            q[np.where(odds[one] < odds[other], one, other), np.arange(q.shape[1])] = 0
+        return np.where(certain, 1.0, q)
 
 
 def choose(
@@ -139,66 +112,61 @@ def choose(
     table: Masks,
     *,
     drawn: Sequence[Drawn],
-    usable: Bools | None = None,
-    statements: Statements | None = None,
-    apart: Ints | None = None,
+    rows: Rows | None = None,
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
 ) -> Choice:
-    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only): in rounds, as the leaves of one
-    hide those behind them in the next.
-
-    `apart` (Q, 2): masks that show different leaves, as the user says. Of each pair, a candidate can have the likelier
-    mask alone.
-    """
-    scores = table.detection_scores.double().numpy()
-    statements = statements or Statements.nothing(len(table))
-    excluded = ~same_class(candidates, table)
-    if usable is not None:
-        excluded |= ~usable[:, None]
-    excluded |= statements.is_of_others[:, None] & candidates.is_certain
-    hides, ranked = np.zeros(len(candidates), bool), None
+    """Choose leaves, and their masks of the table (D masks): in rounds, as the leaves of one hide those behind them in
+    the next. Given masks are as if a detector had found them, with a score of `CHOICE.given`."""
+    rows = Rows.none(len(table), len(candidates)) if rows is None else rows
+    is_made = rows.is_leaf & (candidates.source == 0)
+    scores = np.where(table.origin == Origin.GIVEN, CHOICE.given, table.detection_scores.double())
+    is_other_class = ~same_class(candidates, table)
+    hides, steps, is_leaf, q = np.zeros(len(candidates), bool), list[Step](), rows.is_leaf, rows.shows
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
         q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
-        q[excluded] = 0
-        for one, other in [] if apart is None else apart:
-            odds = q + candidates.certain
-            q[np.where(odds[one] < odds[other], one, other), np.arange(len(candidates))] = 0
-        steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
-        ranked = _accept(candidates, q, steps, statements, min_probability)
-        hides = candidates.is_credible & np.isin(np.arange(len(candidates)), ranked.leaves)
+        q[is_other_class] = 0
+        q = rows.add_to(q, is_made)
+        steps = rank(
+            candidates, q, rows.certain & is_made, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted
+        )
+        chances = np.array([each.chance for each in steps])
+        least = least_chance(chances) if min_probability is None else min_probability
+        is_leaf = rows.is_leaf.copy()
+        for each in steps:
+            is_leaf[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
+        hides = candidates.is_credible & is_leaf
         if not hides.any():
             break
-    assert ranked is not None, "expected one round or more"
-    return _give_masks(ranked, drawn)
+    return _give_masks(steps, is_leaf, q, rows, drawn)
 
 
-def _accept(
-    candidates: Candidates, q: Floats, steps: Sequence[Step], statements: Statements, min_probability: float | None
-) -> _Ranked:
-    least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
-    is_taken = candidates.is_certain.copy()
-    for each in steps:
-        is_taken[each.candidate] |= each.chance >= least and len(each.rows) >= CHOICE.least_views
-    unchanged = statements.unchanged_candidates(q, is_taken)
-    stays = candidates.is_certain | np.isin(np.arange(len(candidates)), unchanged)
-    leaves = np.array([each.candidate for each in steps if (is_taken | stays)[each.candidate]], np.int64)
-    certain = candidates.certain[:, leaves] | (unchanged[:, None] == leaves)
-    return _Ranked(q, tuple(steps), leaves, stays[leaves], certain)
-
-
-def _give_masks(ranked: _Ranked, drawn: Sequence[Drawn]) -> Choice:
-    """The leaves with their masks; one with too few of them is none, unless the user says so."""
-    leaf, q = assign_masks(ranked.q[:, ranked.leaves], drawn)
-    if len(ranked.leaves):
-        is_certain = ranked.certain.any(1)
-        leaf, q = np.where(is_certain, ranked.certain.argmax(1), leaf), np.where(is_certain, 1.0, q)
-    counts = np.bincount(leaf[leaf >= 0], minlength=len(ranked.leaves))
-    is_left = (counts >= CHOICE.least_views) | ranked.stays
+def _give_masks(steps: Sequence[Step], is_leaf: Bools, q: Floats, rows: Rows, drawn: Sequence[Drawn]) -> Choice:
+    """The leaves with their masks; one with too few of them is none, unless the user, or given masks, say so."""
+    is_held, every = np.isin(np.arange(len(is_leaf)), rows.held), np.arange(len(q))
+    columns = np.array([each.candidate for each in steps if is_leaf[each.candidate]], np.int64)
+    columns = np.concatenate((columns, np.flatnonzero(is_held & ~is_leaf)))
+    if not len(columns):
+        return Choice(columns, np.zeros(0), np.full(len(q), -1), np.zeros(len(q)), tuple(steps))
+    place = np.full(len(is_leaf) + 1, -1)
+    place[columns] = np.arange(len(columns))
+    own, certain = place[rows.held], rows.certain[:, columns]
+    free = np.where(is_leaf, q, 0.0)[:, columns]
+    stay = np.maximum(free[every, own], rows.hold)
+    free = np.where(free >= rows.hold[:, None], free, 0.0)
+    free[every[own >= 0], own[own >= 0]] = stay[own >= 0]
+    leaf, chance = assign_masks(free, drawn)
+    leaf = np.where(leaf < 0, own, leaf)  # no mask loses its id without getting another
+    is_certain, stays = certain.any(1), np.asarray(certain.any(0))
+    leaf, chance = np.where(is_certain, certain.argmax(1), leaf), np.where(is_certain, 1.0, chance)
+    counts = np.bincount(leaf[leaf >= 0], minlength=len(columns))
+    is_left = (counts >= CHOICE.least_views) | stays | (is_held[columns] & (counts > 0))
     place = np.append(np.where(is_left, is_left.cumsum() - 1, -1), -1)  # of no leaf, too
+    chances = {each.candidate: each.chance for each in steps}
+    of_leaf = np.where(stays[is_left], 1.0, [chances[index] for index in columns[is_left].tolist()])
     leaf = place[leaf]
-    return Choice(ranked.leaves[is_left], ranked.chances[is_left], leaf, q * (leaf >= 0), ranked.steps)
+    return Choice(columns[is_left], of_leaf, leaf, chance * (leaf >= 0), tuple(steps))
 
 
 def same_class(candidates: Candidates, table: Masks) -> Bools:
@@ -211,26 +179,33 @@ def same_class(candidates: Candidates, table: Masks) -> Bools:
 
 
 def rank(
-    candidates: Candidates, q: Floats, *, drawn: Sequence[Drawn], share: Floats, scores: Floats, fitted: LeafScores
+    candidates: Candidates,
+    q: Floats,
+    certain: Bools,
+    *,
+    drawn: Sequence[Drawn],
+    share: Floats,
+    scores: Floats,
+    fitted: LeafScores,
 ) -> list[Step]:
-    """The candidates, the likeliest leaf first; each takes masks that those after it can no longer have, and with them
-    all that show the same."""
+    """Rank candidates by P. Each one takes its masks and removes overlapping masks from the rest."""
     view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
     for number, each in enumerate(drawn):
         view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
     is_open, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
-    sure, rows_of_views = log_odds(scores), [each.rows for each in drawn]
+    sure, rows_of_views, is_first = log_odds(scores), [each.rows for each in drawn], certain.any(0)
     while is_open.any():
         best, row = best_masks(free, rows_of_views)
         features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
-        chances = np.where(is_open, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
+        chances = np.where(is_first, 1.0, leaf_chances(candidates, features, fitted))
+        chances = np.where(is_open, np.round(chances, CHOICE.digits), -1.0)
         first = int(chances.argmax())
         own = best[:, first]
-        rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
-        rows = np.union1d(rows, np.flatnonzero(candidates.certain[:, first]))
-        steps.append(Step(first, float(chances[first]), features[first], rows))
+        mine = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
+        mine = np.union1d(mine, np.flatnonzero(certain[:, first]))
+        steps.append(Step(first, float(chances[first]), features[first], mine))
         is_open[first] = False
-        for taken in rows.tolist():
+        for taken in mine.tolist():
             there = drawn[view[taken]]
             free[there.rows[there.is_shared[place[taken]]]] = 0
     return steps

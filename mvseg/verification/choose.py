@@ -1,10 +1,13 @@
-"""The views choose: of everything that the detector proposes, which masks show which leaf.
+"""The views choose: of all proposals, which masks show which leaf.
 
 A detector's score says how much a mask looks like the leaves that it has learned, not whether it is one. So the
 excessive set is kept, weak proposals included, and the views decide. Candidates are the instances that the matcher
 finds among the sure proposals, and again among many more, each with its surface. The likeliest leaf comes first and
 takes its masks; the others are judged by what is left (`leaf_scores.py`). So duplicates, pieces and masks over two
 leaves fall by themselves. The paper's idea of an excessive set from which the views choose, with surfaces for maps.
+
+Given masks are proposals, too, which the matcher has found one leaf for: they are held to it (`Rows.held`), and another
+leaf takes them only with a q of `SURE` or more. So no mask loses its id without getting another.
 """
 
 from __future__ import annotations
@@ -18,17 +21,18 @@ from torch import Tensor
 
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
-from mvseg.masks import Masks, Origin
-from mvseg.reconstruction.numbers import TUBE
-from mvseg.reconstruction.stem.tube_evidence import tube_evidence
+from mvseg.masks import SURE, Masks, Origin
+from mvseg.matching.config import MatchConfig
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
-from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choice import Choice, Statements, choose
-from mvseg.verification.evidence import Bools, Drawn, Floats, draw_views
-from mvseg.verification.leaf_scores import Candidates
-from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
+from mvseg.verification.candidates import Candidates, Fit, Key, gather_candidates
+from mvseg.verification.choice import Choice, Rows, choose
+from mvseg.verification.evidence import Bools, Drawn, Ints, draw_views, see
+from mvseg.verification.leaf_scores import show_chances
+from mvseg.verification.match_again import match_again
+from mvseg.verification.numbers import AGAIN, CHOICE, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
 
 
@@ -45,133 +49,223 @@ class Leaves:
     """Accepted leaves.
 
     Attributes:
-        masks: D' masks on the CPU, by view and instance, with ids from 1 on, the likeliest leaf first; match scores are
-            q, and `labels` of proposals their rows. At most one of each leaf in a view, but for those of the user;
-            of these, the ones that show no leaf have -1.
+        masks: D' masks on the CPU with ids from 1 on. Of proposals of a detector, those of leaves, by view and
+            instance, the likeliest leaf first; match scores are q. At most one mask per leaf and view, except the
+            user's; masks of the user without a leaf have id -1. Given masks are all there, in their order; those that
+            moved have q as their match score.
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
         rejected: the candidates that were not chosen, the most likely first.
-        agreement: share of a leaf's expected area that its masks show; mean over the leaves that have
-            a surface, NaN without any. Pieces of leaves, whose ids mix, have little.
+        keys: {instance id: key of its candidate}.
+        agreement: share of a leaf's expected area that its masks show; mean over the leaves that have a surface, NaN
+            without any. Pieces of leaves, whose ids mix, have little.
     """
 
     masks: Masks
     surfaces: dict[int, LeafSurface]
     probabilities: dict[int, float]
     rejected: tuple[RejectedCandidate, ...]
+    keys: dict[int, Key]
     agreement: float = float("nan")
+
+    @staticmethod
+    def of(matched: Masks) -> Leaves:
+        """Leaves as they were matched, without probabilities."""
+        ids = matched.instance_ids
+        keys = {each: tuple(sorted(matched.proposal[ids == each].tolist())) for each in ids[ids > 0].unique().tolist()}
+        return Leaves(matched, {}, {}, (), keys)
+
+
+@dataclass(frozen=True, eq=False)
+class Edited:
+    """Masks after edits.
+
+    Attributes:
+        masks: D' masks, matched again.
+        keys: D', the candidate that each mask's leaf was before, None without one, and where edits change the leaf.
+        stays: (D',) bool, masks of leaves that edits mention, but do not change.
+        gone: (N,) int64, proposals that the user took away or changed.
+        apart: (Q, 2) int64, pairs of the D' masks that show different leaves, as the user says.
+    """
+
+    masks: Masks
+    keys: tuple[Key | None, ...]
+    stays: Tensor
+    gone: Tensor
+    apart: Tensor
+
+    @property
+    def is_held(self) -> Tensor:
+        """(D',) bool: an edit is about the mask, or it follows from one."""
+        masks = self.masks
+        return masks.is_corrected | masks.is_linked | (masks.origin == Origin.OTHER_VIEWS)
+
+    @property
+    def is_certain(self) -> Tensor:
+        """(D',) bool: held masks, except those of which edits only say which leaf they do not show."""
+        masks = self.masks
+        return self.is_held & ~(masks.is_linked & ~masks.is_corrected & (masks.instance_ids < 1))
+
+    def concerned(self) -> Masks:
+        """The masks with the ids of the instances that edits change."""
+        ids = self.masks.instance_ids
+        is_changed = torch.isin(ids, ids[self.is_held & ~self.stays]) & ~self.stays
+        return replace(self.masks, instance_ids=ids.where(is_changed, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class Judges:
+    """Means to judge candidates by.
+
+    Attributes:
+        cameras: V cameras, on the CPU.
+        has_surfaces: whether surfaces judge; otherwise matching and scores do.
+        holds: whether masks are held to what they were matched to: given masks.
+        min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
+        cache: of surfaces.
+    """
+
+    cameras: Cameras
+    has_surfaces: bool = True
+    holds: bool = False
+    min_probability: float | None = None
+    cache: SurfaceCache | None = None
+
+    def fit(self, masks: Masks) -> Mapping[int, LeafSurface]:
+        """{instance id: surface}. Those of given masks are few, and final; others are fitted roughly."""
+        if self.holds:
+            return fit_surfaces(masks.regions, masks.instance_ids, self.cameras, cache=self.cache)
+        return fit_roughly(masks, self.cameras, self.cache)
+
+
+def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | None:
+    """Match given masks that do not show their own leaf once more, see `match_again`.
+
+    Args:
+        matched: D masks on the CPU, which are all the proposals.
+        config: that they were matched with.
+    """
+    if not judges.has_surfaces or not matched.num_instances:
+        return None
+    candidates = _gather([matched], [matched.proposal], matched, judges.fit, judges)
+    drawn, own = draw_views(matched.regions, candidates.surfaces, judges.cameras), candidates.of_rows(0)
+    scores = np.full(len(matched), CHOICE.given)
+    q = show_chances(candidates, see(drawn, len(matched), candidates.is_credible), scores)
+    own_q = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), own]
+    return match_again(matched, own, q=own_q, cameras=judges.cameras, config=config)
 
 
 def choose_leaves(
-    matched: Masks,
     proposals: Masks,
+    matched: Sequence[Masks],
+    judges: Judges,
     *,
-    cameras: Cameras,
-    more: Sequence[Masks] = (),
-    removed: Masks | None = None,
-    previous: Tensor | None = None,
-    apart: Tensor | None = None,
+    edited: Edited | None = None,
     drawn: Sequence[Drawn] = (),
-    min_probability: float | None = None,
-    cache: SurfaceCache | None = None,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
     Masks that the user corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
-    that no detector found. What else lies there goes, and what the user took away does not come back. All other
+    that no detector found. Overlapping proposals are dropped; deleted masks are not proposed again. All other
     candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. A leaf
     that satisfies all edits about it already keeps its candidate from before the edits.
 
     Args:
-        matched: D masks, matched; `labels` of detected ones are rows of `proposals`.
-        proposals: R masks with detection scores, the excessive set; their ids do not matter.
-        more: masks of other matchings, of more of the proposals, with such labels, too.
-        removed: masks that the user took away; None: nobody edited the masks. Otherwise only the instances of the
-            user's masks are candidates here, and `more` has the others.
-        previous: (D,) int64, the leaf of each mask before the edits, if they leave that leaf unchanged; otherwise -1.
-            None: -1 everywhere.
-        apart: (Q, 2) int64, pairs of the D masks that show different leaves, as the user says; None: none do.
+        proposals: R masks, the excessive set, or given masks; their ids do not matter.
+        matched: tables of some of the proposals, each matched, the sure ones first.
         drawn: V views of the proposals alone, where they were drawn before.
-        min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
     Returns:
         The leaves. Where the cameras see the plant from one side only, by less than `ROUGH.least_parallax`, surfaces
-        are too uncertain to judge by: matching and detection scores do it, and a warning (InputWarning) says so.
+        are too uncertain to judge what a detector proposes: matching and detection scores do it, and a warning
+        (InputWarning) says so.
     """
-    matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
-    proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
-    previous = torch.full_like(matched.instance_ids, -1) if previous is None else previous.cpu()
-    ids, origin, stays = matched.instance_ids, matched.origin, previous > 0
-    is_held = matched.is_corrected | matched.is_linked | (origin == Origin.OTHER_VIEWS) | (origin == Origin.GIVEN)
-    is_apart = matched.is_linked & ~matched.is_corrected & (ids < 1)  # an edit only says which leaf it does not show
-    is_sure = is_held & ~is_apart
-    is_added = ~_are_proposals(matched, proposals) | (is_held & ~stays)  # the user's, and what was cut since
-    added = matched.select(is_added)
-    row_of = matched.regions.labels.clone()
-    row_of[is_added] = len(proposals) + torch.arange(len(added))
-    table = _mark(Masks.concatenate((proposals, added)), matched, row_of)
-    statements = Statements.of(len(table), row_of.numpy(), is_held=is_held, is_sure=is_sure, leaf=previous)
-    usable = np.ones(len(table), bool)
-    if removed is not None:
-        ids = ids.where(torch.isin(ids, ids[is_held & ~stays]) & ~stays, -1)
-        others = Masks.concatenate((removed.to("cpu"), matched.select(is_held & is_added)))
-        usable[: len(proposals)] = _without(proposals, others)
-    tables = [(replace(matched, instance_ids=ids), row_of)]
-    tables += [(each.to("cpu"), each.regions.labels.cpu()) for each in more]
-    is_edited = removed is not None and len(more) > 0 and more[0].num_instances > 0  # then `matched` may have few ids
-    has_shapes = _is_surrounded(more[0].to("cpu") if is_edited else matched, cameras)
-    candidates = gather_candidates(tables, cameras if has_shapes else None, table=table, is_held=is_held, cache=cache)
-    views = draw_views(table.regions, candidates.surfaces, cameras, first=drawn)
-    is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
-    for each in views:
-        own = is_made[each.rows]
-        usable[each.rows] &= own | ~each.is_shared[:, own].any(1)
-    chosen = choose(
-        candidates,
-        table,
-        drawn=views,
-        usable=usable,
-        statements=statements,
-        apart=None if apart is None else row_of[apart].numpy(),
-        min_probability=min_probability,
-    )
-    return _make_leaves(chosen, candidates, table, is_held=statements.is_sure)
+    proposals, matched = proposals.to("cpu"), [each.to("cpu") for each in matched]
+    if judges.holds and not judges.has_surfaces and edited is None:
+        return Leaves.of(matched[0])
+    table, row_of = _add_made(proposals, edited)
+    is_judged = judges.has_surfaces and (judges.holds or _is_surrounded(matched[0], edited, judges.cameras))
+    tables, rows = list(matched), [each.proposal for each in matched]
+    if edited is not None:  # first, so that what edits say of a leaf is not the same as what was there before
+        tables, rows = [edited.concerned(), *tables], [row_of, *rows]
+    candidates = _gather(tables, rows, table, judges.fit if is_judged else None, judges)
+    views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn)
+    terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
+    if judges.holds:
+        terms = _hold(terms, edited, candidates, table, row_of)
+    chosen = choose(candidates, table, drawn=views, rows=terms, min_probability=judges.min_probability)
+    if judges.holds:
+        return _make_given(chosen, candidates, table.select(row_of), row_of, terms)
+    is_users = np.zeros(len(table), bool)
+    if edited is not None:
+        is_users[row_of[edited.is_certain]] = True
+    return _make_leaves(chosen, candidates, table, is_users)
 
 
-def _mark(table: Masks, matched: Masks, row_of: Tensor) -> Masks:
-    """The table with what the user said of the matched masks that are in it."""
+def _add_made(proposals: Masks, edited: Edited | None) -> tuple[Masks, Tensor]:
+    """The proposals, and after them the masks that edits made; and (D',) the row of each mask of the edited table."""
+    if edited is None:
+        return proposals, torch.arange(len(proposals))
+    masks, made = edited.masks, edited.masks.proposal < 0
+    row_of = torch.where(made, len(proposals) - 1 + made.cumsum(0), masks.proposal)
+    table = Masks.concatenate((proposals, masks.select(made)))
     origin, is_linked = table.origin.clone(), table.is_linked.clone()
-    origin[row_of], is_linked[row_of] = matched.origin, matched.is_linked
-    return replace(table, origin=origin, is_linked=is_linked)
+    origin[row_of], is_linked[row_of] = masks.origin, masks.is_linked
+    return replace(table, origin=origin, is_linked=is_linked), row_of
 
 
-def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
-    """The masks, and after them the others that show something else than these (`EVIDENCE.shared`); by view."""
-    both = Masks.concatenate((masks, others))
-    is_added = torch.ones(len(both), dtype=torch.bool)
-    for each in draw_views(both.regions, (), cameras.to("cpu")):
-        is_first = each.rows < len(masks)
-        is_added[each.rows] = torch.from_numpy(is_first | ~each.is_shared[:, is_first].any(1))
-    kept = both.select(is_added)
-    return kept.select(kept.view_index.argsort(stable=True))
+def _gather(
+    tables: Sequence[Masks], rows: Sequence[Tensor], table: Masks, fit: Fit | None, judges: Judges
+) -> Candidates:
+    return gather_candidates(tables, rows, table=table, fit=fit, cameras=judges.cameras)
 
 
-def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
-    labels, regions = matched.regions.labels, proposals.regions
-    is_there = (labels >= 0) & (labels < len(proposals))
-    for row in is_there.nonzero()[:, 0].tolist():
-        label = int(labels[row])
-        is_there[row] = torch.equal(matched.regions.boxes[row], regions.boxes[label]) and torch.equal(
-            matched.regions.crop(row), regions.crop(label)
-        )
-    return is_there
-
-
-def _is_surrounded(matched: Masks, cameras: Cameras) -> bool:
-    parallax = median_parallax(matched, cameras)
+def _is_surrounded(matched: Masks, edited: Edited | None, cameras: Cameras) -> bool:
+    masks = matched if matched.num_instances or edited is None else edited.masks
+    parallax = median_parallax(masks, cameras)
     if parallax < ROUGH.least_parallax:
         warn(Finding("leaves_seen_from_one_side", values={"degrees": parallax}))
     return parallax >= ROUGH.least_parallax
+
+
+def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, drawn: Sequence[Drawn]) -> Rows:
+    """The user as a term."""
+    masks, held, stays = edited.masks, edited.is_held.numpy(), edited.stays.numpy()
+    shows, rows = np.zeros((len(table), len(candidates))), row_of.numpy()
+    index = {key: number for number, key in enumerate(candidates.keys)}
+    changed, is_changed = candidates.of_rows(0), candidates.source == 0
+    certain = edited.is_certain.numpy()
+    for mask in np.flatnonzero(held).tolist():
+        key = edited.keys[mask]
+        candidate = index.get(key, -1) if stays[mask] and key is not None else int(changed[rows[mask]])
+        shows[rows[mask], is_changed] = -np.inf
+        if certain[mask] and candidate >= 0:
+            shows[rows[mask], candidate] = np.inf
+    others = Masks.concatenate((table.select(edited.gone), masks.select(edited.is_held & ~edited.stays)))
+    is_out = ~_without(table, others)
+    is_out[rows[held]] = False
+    is_made = ((table.origin == Origin.CORRECTED) | (table.origin == Origin.CUT)).numpy()
+    for each in drawn:
+        own = is_made[each.rows]
+        is_out[each.rows] |= ~own & each.is_shared[:, own].any(1)
+    shows[is_out] = -np.inf
+    return replace(Rows.none(*shows.shape), shows=shows, apart=row_of[edited.apart].numpy())
+
+
+def _hold(terms: Rows, edited: Edited | None, candidates: Candidates, table: Masks, row_of: Tensor) -> Rows:
+    """The ids of given masks as a term: those of the matcher, and after edits those before them."""
+    held = candidates.of_rows(0)
+    if edited is not None:
+        index = {key: number for number, key in enumerate(candidates.keys)}
+        before = [-1 if key is None else index.get(key, -1) for key in edited.keys]
+        rows = row_of.numpy()
+        held[rows] = np.where(held[rows] < 0, before, held[rows])
+    hold = np.where(table.origin == Origin.GIVEN, SURE, 0.0)
+    if table.regions.num_views < AGAIN.least_views:  # two masks always agree on some surface
+        scores = np.append(candidates.matched, np.full((len(table), 1), np.nan), 1)[np.arange(len(table)), held]
+        hold = np.where(scores >= SURE, 1.0, hold)
+    is_gone = np.isneginf(terms.shows).all(1)
+    return replace(terms, held=np.where(is_gone, -1, held), hold=hold)
 
 
 def _without(proposals: Masks, others: Masks) -> Bools:
@@ -184,82 +278,26 @@ def _without(proposals: Masks, others: Masks) -> Bools:
     return stays
 
 
-def gather_candidates(
-    matched: Sequence[tuple[Masks, Tensor]],
-    cameras: Cameras | None,
-    *,
-    table: Masks,
-    is_held: Tensor,
-    surfaces: Mapping[int, LeafSurface] | None = None,
-    cache: SurfaceCache | None = None,
-) -> Candidates:
-    """The instances of each matching; those that an earlier one has, too, once.
-
-    Args:
-        matched: masks of each matching and (D,) their rows in the table.
-        cameras: that surfaces are fitted with; None: no surfaces.
-        table: R' masks.
-        is_held: (D,) bool, of the masks of the first matching.
-        surfaces: {instance id: surface} of the first matching; None: they are fitted here.
-    """
-    areas = table.regions.areas.double()
-    shapes: list[LeafSurface | None] = []
-    members: list[Tensor] = []  # rows of the table, of each candidate
-    columns, certain = [], []
-    for number, (masks, rows) in enumerate(matched):
-        ids = masks.instance_ids
-        instances = ids[ids > 0].unique().tolist()
-        new = [each for each in instances if not _is_there(rows[ids == each], members, areas)]
-        is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
-        fitted: Mapping[int, LeafSurface] = {}
-        if number == 0 and surfaces is not None:
-            fitted = surfaces
-        elif cameras is not None:
-            fitted = fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras, cache)
-        for each in new:
-            own = ids == each
-            members.append(rows[own])
-            surface = fitted.get(each)
-            shapes.append(surface if surface is not None and surface.exists else None)
-            columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))
-            columns[-1][rows[own]] = masks.match_scores[own].double()
-            certain.append(torch.zeros(len(table), dtype=torch.bool))
-            if number == 0:
-                certain[-1][rows[own & is_held]] = True
-    if not columns:
-        nothing = np.zeros((len(table), 0))
-        return Candidates((), nothing, nothing.astype(bool), stem=np.zeros(0))
-    stem = np.zeros(len(shapes)) if cameras is None else _stem_chances(shapes, members, table.regions, cameras)
-    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy(), stem=stem)
-
-
-def _stem_chances(
-    surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
-) -> Floats:
-    ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
-    tubes = tube_evidence(
-        regions.select(torch.cat(list(members))),
-        ids,
-        cameras,
-        surfaces={number: each for number, each in enumerate(surfaces, start=1) if each is not None},
-        least_aspect=TUBE.least_aspect,
+def _make_given(chosen: Choice, candidates: Candidates, masks: Masks, row_of: Tensor, terms: Rows) -> Leaves:
+    """Leaves of given masks, numbered in the order of their candidates."""
+    rows, order = row_of.numpy(), np.argsort(chosen.candidates)
+    number = np.append(np.empty_like(order), -2)
+    number[order] = np.arange(len(order))
+    ids = number[chosen.leaf[rows]] + 1
+    to = np.append(chosen.candidates, -1)[chosen.leaf[rows]]
+    matched = np.append(candidates.matched, np.full((len(candidates.matched), 1), np.nan), 1)[rows, to]
+    scores = np.where(np.isnan(matched) | terms.certain[rows].any(1), chosen.q[rows], matched)
+    given = replace(
+        masks,
+        instance_ids=torch.from_numpy(np.where(ids > 0, ids, -1)),
+        match_scores=torch.from_numpy(scores).float(),
     )
-    stem = np.zeros(len(surfaces))
-    for number, evidence in tubes.items():
-        stem[number - 1] = evidence.probability
-    return stem
+    keys = {place + 1: candidates.keys[index] for place, index in enumerate(chosen.candidates[order].tolist())}
+    return replace(Leaves.of(given), keys=keys)
 
 
-def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
-    for others in members:
-        common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
-        if common > CHOICE.same * either:
-            return True
-    return False
-
-
-def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:
-    rows = np.flatnonzero((chosen.leaf >= 0) | is_held)
+def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, is_users: Bools) -> Leaves:
+    rows: Ints = np.flatnonzero((chosen.leaf >= 0) | is_users)
     rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
     ids = np.where(chosen.leaf[rows] >= 0, chosen.leaf[rows] + 1, -1)
     masks = replace(
@@ -280,5 +318,17 @@ def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, *, is_hel
             for each in chosen.steps
             if each.candidate not in taken and len(each.rows)
         ),
+        keys={number: candidates.keys[each] for number, each in enumerate(chosen.candidates.tolist(), 1)},
         agreement=float(np.round(np.mean(shares), CHOICE.digits)) if shares else float("nan"),
     )
+
+
+def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
+    """The masks, and after them the others that show something else than these (`EVIDENCE.shared`); by view."""
+    both = Masks.concatenate((masks, others))
+    is_added = torch.ones(len(both), dtype=torch.bool)
+    for each in draw_views(both.regions, (), cameras.to("cpu")):
+        is_first = each.rows < len(masks)
+        is_added[each.rows] = torch.from_numpy(is_first | ~each.is_shared[:, is_first].any(1))
+    kept = both.select(is_added)
+    return kept.select(kept.view_index.argsort(stable=True))

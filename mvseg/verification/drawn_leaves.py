@@ -203,6 +203,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         detection_scores=torch.where(is_new, torch.nan, more.detection_scores),
         origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
         is_linked=more.is_linked & ~is_new,
+        proposal=torch.where(is_new, min(int(masks.proposal.min()), 0) - torch.arange(len(rows)) - 1, more.proposal),
     )
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,8 +15,8 @@ from scipy.special import expit, logit
 from torch import Tensor
 
 from mvseg.masks import Masks
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.verification.evidence import Bools, Evidence, Floats, Ints
+from mvseg.verification.candidates import Candidates
+from mvseg.verification.evidence import Evidence, Floats, Ints
 from mvseg.verification.numbers import CHOICE
 
 
@@ -47,52 +46,6 @@ FITTED = LeafScores(
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """K instances that may be leaves.
-
-    Attributes:
-        surfaces: K, None where the masks of one agree on none.
-        matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
-        certain: (D, K) bool: the user says that the mask shows the candidate.
-        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 where no tube was tried (no surface, or not
-            slender).
-    """
-
-    surfaces: tuple[LeafSurface | None, ...]
-    matched: Floats
-    certain: Bools
-    stem: Floats
-
-    def __len__(self) -> int:
-        return len(self.surfaces)
-
-    @property
-    def is_certain(self) -> Bools:
-        """(K,) those that the user says are leaves."""
-        return np.asarray(self.certain.any(0), bool)
-
-    @cached_property
-    def has_surface(self) -> Bools:
-        """(K,)"""
-        return np.array([each is not None for each in self.surfaces], bool)
-
-    @cached_property
-    def is_credible(self) -> Bools:
-        """(K,) those whose surface may hide others."""
-        return np.array([each is not None and each.is_credible for each in self.surfaces], bool)
-
-    @cached_property
-    def lengths(self) -> Floats:
-        """(K,) lengths of the surfaces, world units; NaN for none."""
-        return np.array([np.nan if each is None else each.length for each in self.surfaces], float)
-
-    @cached_property
-    def fits(self) -> Floats:
-        """(K,) median IoU of the surfaces with the masks that they were fitted to; 0.5 for none."""
-        return np.array([0.5 if each is None else float(each.iou.nanmedian()) for each in self.surfaces], float)
-
-
-@dataclass(frozen=True, eq=False)
 class ClearLeaves:
     """Measures of the clear leaves of one plant, by which its other candidates are judged: a plant that the detector
     has not learned scores low everywhere.
@@ -108,7 +61,7 @@ class ClearLeaves:
 
 def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
     """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
-    masks that were matched to a candidate can; what the user says is certain."""
+    masks that were matched to a candidate can."""
     q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
     q = np.where(np.isnan(candidates.matched), 0.0, q)
     with_surface = candidates.has_surface
@@ -116,8 +69,6 @@ def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fit
         odds = shows_features(evidence, scores) @ list(fitted.shows.values())
         by_surface = expit(odds) * (evidence.claimed > 0)
         q = np.where(with_surface, by_surface, q)
-    q[candidates.certain.any(1)] = 0
-    q[candidates.certain] = 1
     return q
 
 
@@ -134,11 +85,11 @@ def matched_features(matched: Floats, scores: Floats) -> Floats:
 
 
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(K,) P: how likely each candidate is a leaf, and no stem; 1 where the user says so."""
+    """(K,) P: how likely each candidate is a leaf, and no stem."""
     by_surface = expit(features @ list(fitted.leaf.values()))
     by_masks = expit(features[:, : len(fitted.leaf_matched)] @ list(fitted.leaf_matched.values()))
     chances: Floats = np.where(candidates.has_surface, by_surface * (1 - candidates.stem), by_masks)
-    return np.where(candidates.is_certain, 1.0, chances)
+    return chances
 
 
 def leaf_features(

@@ -176,7 +176,7 @@ def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.Mo
     edit = Reject(view="v0", at=at(1, 0), everywhere=True)
     expected, plant, used = run(edit), run(), []
 
-    def choose(*given: Masks, drawn: tuple[Drawn, ...], **options: Any) -> Leaves:
+    def choose(*given: Any, drawn: tuple[Drawn, ...], **options: Any) -> Leaves:
         used.append(drawn)
         return choosing.choose_leaves(*given, drawn=drawn, **options)
 
@@ -185,7 +185,7 @@ def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.Mo
     assert all("is_shared" in vars(each) for each in ahead)
     for name in ("plant.draw_views", "plant.add_beside"):
         monkeypatch.setattr(f"mvseg.pipeline.{name}", None)  # nobody waits for these again
-    monkeypatch.setattr("mvseg.pipeline.apply_edits.choose_leaves", choose)
+    monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
     found = apply_edits(plant, Corrections((edit,)))
     assert used == [ahead]
     assert found.instances.probabilities == expected.instances.probabilities
@@ -200,7 +200,8 @@ def test_two_masks_that_a_person_keeps_apart_never_have_one_id(monkeypatch: pyte
     """Although a candidate from before the edit holds both, and they are all that it has."""
     stays = (leaf != IDS) | torch.isin(REGIONS.view_index, torch.tensor([0, 3]))
     few = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9)).select(stays)
-    ids, few = IDS[stays], replace(few, regions=replace(few.regions, labels=torch.arange(len(few))))
+    ids, rows = IDS[stays], torch.arange(int(stays.sum()))
+    few = replace(few, regions=replace(few.regions, labels=rows), proposal=rows)
     see_masks(monkeypatch, FoundMasks(Matching(few.select(ids != WEAK), MatchReport("nview")), few, more=few))
 
     def fit_few(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:

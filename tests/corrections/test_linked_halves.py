@@ -31,7 +31,7 @@ def link(maps: list[np.ndarray], pair: Pair, views: Pair, **links: list[Pair]) -
         int(((ids == label) & (regions.view_index == view)).nonzero()) for label, view in zip(pair, views, strict=True)
     )
     edited = Corrected(Masks.of(regions), Links.of([(first, second)], **links), torch.zeros(len(ids)), (), (), ())
-    return link_halves(edited, Masks.of(regions, ids), CAMERAS)
+    return link_halves(edited, ids, CAMERAS)
 
 
 @pytest.mark.parametrize("views", [(0, 0), (1, 4)])

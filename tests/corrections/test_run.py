@@ -26,10 +26,10 @@ from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import match_given
 from mvseg.results.result import Result
-from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.choose import choose_leaves
+from mvseg.verification.choose import Edited, Judges, choose_leaves
 from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
+from verified import verify_ids
 from warned import warns_of
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -65,7 +65,8 @@ def test_without_edits_it_is_todays_result(plant: Path) -> None:
     agreed = run_scene(plant, plant / "masks", IDS_ONLY, corrections=agreeing)
     for other in (empty, agreed):
         assert torch.equal(plain.masks.instance_ids, other.masks.instance_ids)
-        assert torch.equal(plain.masks.match_scores, other.masks.match_scores)
+        is_same = ~other.masks.is_linked
+        assert torch.equal(plain.masks.match_scores[is_same], other.masks.match_scores[is_same])
         assert torch.equal(plain.masks.regions.crops, other.masks.regions.crops)
     assert empty.fates == ()
     assert [each.fate for each in agreed.fates] == ["applied"]
@@ -98,7 +99,7 @@ def test_edits_do_not_estimate_the_reprojection_error_again(plant: Path, monkeyp
     drawn = [
         {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()} for (view, _), polygon in outlines.items()
     ]
-    apply_edits(matched, corrections({"op": "reject"} | at(plant, 0, 1)))
+    apply_edits(matched, corrections({"op": "different", "at": [place(plant, 0, 1), place(plant, 3, 1)]}))
     apply_edits(matched, corrections(*drawn))
     assert asked == [matched.matching.report.residual_px, None]
     assert asked[0] is not None
@@ -151,26 +152,36 @@ def squares(masks: Masks) -> list[tuple[list[int], int]]:
     return [(masks.regions.boxes[row].tolist(), int(masks.regions.areas[row])) for row in rows]
 
 
+def edit(masks: Masks) -> Edited:
+    """Masks as edits left them."""
+    apart, gone = torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+    return Edited(masks, (None,) * len(masks), masks.origin < 0, gone, apart)
+
+
 @pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])
 def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin, monkeypatch: pytest.MonkeyPatch) -> None:
     masks, stays = wrong_masks(origin), [([0, 0, 9, 9], 81)]
-    regions, scores = replace(masks.regions, labels=torch.arange(len(masks))), torch.full((len(masks),), 0.8)
-    numbered = replace(masks, regions=regions, detection_scores=scores)
+    masks = replace(masks, detection_scores=torch.full((len(masks),), 0.8))
+    proposals = replace(masks, origin=torch.full_like(masks.origin, Origin.DETECTED))
     for surfaces in (LEAVES, {}):
         monkeypatch.setattr("mvseg.verification.choose.fit_roughly", lambda *_, known=surfaces: known)
-        chosen = choose_leaves(numbered, numbered, cameras=CAMERAS)
+        chosen = choose_leaves(proposals, [proposals], Judges(CAMERAS), edited=edit(masks))
         assert squares(chosen.masks) == (stays if origin in CORRECTED or not surfaces else [])
 
 
-@pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])
+@pytest.mark.parametrize("origin", [Origin.GIVEN, *CORRECTED])
 def test_surfaces_do_not_move_a_corrected_mask(origin: Origin) -> None:
     regions, ids = as_regions(true_maps())
     wrong = ids.clone()
     row = int(((regions.view_index == 2) & (ids == 1)).nonzero()[0, 0])
     wrong[row] = 2
-    masks = Masks.of(regions, wrong, torch.full((len(ids),), 0.9), origin=Origin.DETECTED)
+    given = Masks.of(regions, wrong, torch.full((len(ids),), 0.9))
+    masks = replace(given, origin=given.origin.clone())
     masks.origin[row] = origin
-    assert int(check_ids(masks, LEAVES, cameras=CAMERAS).instance_ids[row]) == (2 if origin in CORRECTED else 1)
+    found = verify_ids(given, LEAVES, cameras=CAMERAS, edited=edit(masks)).instance_ids
+    others = torch.arange(len(ids)) != row
+    leaf = 2 if origin in CORRECTED else 1
+    assert int(found[row]) == int(found[(ids == leaf) & others].mode().values)
 
 
 @pytest.mark.slow

@@ -202,7 +202,7 @@ class TestContent:
         run = json.loads((saved / "run.json").read_text())
         assert (run["mvseg"], run["config"]) == ("1.2.3", {"seed": 5})
         assert run["counts"] == {"regions": 12, "instances": 3}
-        assert set(run["seconds"]) == {"load", "match", "check", "voxels", "measure"}
+        assert set(run["seconds"]) == {"load", "match", "choose", "check", "voxels", "measure"}
 
     def test_every_file_and_field_is_described(self, saved: Path) -> None:
         described = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")

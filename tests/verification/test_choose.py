@@ -3,6 +3,7 @@ propose of them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +17,11 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
-from mvseg.verification.choose import Leaves, add_beside, choose_leaves, gather_candidates
+from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
 from mvseg.verification.evidence import draw_views
-from mvseg.verification.leaf_scores import Candidates, leaf_features
+from mvseg.verification.leaf_scores import leaf_features
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -56,10 +58,26 @@ TRUTH = IDS
 PROPOSALS = proposals_of(REGIONS, torch.full((len(REGIONS),), 0.8))
 
 
-def choose(matched: Masks, proposals: Masks = PROPOSALS, cameras: Cameras = CAMERAS, **more: object) -> Leaves:
+def choose(
+    matched: Masks,
+    proposals: Masks = PROPOSALS,
+    *,
+    cameras: Cameras = CAMERAS,
+    edited: Edited | None = None,
+    min_probability: float | None = None,
+    fit: Callable[..., dict[int, LeafSurface]] = fit,
+) -> Leaves:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mvseg.verification.choose.fit_roughly", more.pop("fit", fit))
-        return choose_leaves(matched, proposals, cameras=cameras, **more)  # type: ignore[arg-type]
+        patch.setattr("mvseg.verification.choose.fit_roughly", fit)
+        judges = Judges(cameras, min_probability=min_probability)
+        return choose_leaves(proposals, [matched], judges, edited=edited)
+
+
+def edit(masks: Masks, *, keys: Sequence[Key] = (), gone: Sequence[int] = ()) -> Edited:
+    """Masks as edits left them; with keys, all leaves stay as they were."""
+    stays = torch.full((len(masks),), bool(keys))
+    apart = torch.zeros(0, 2, dtype=torch.int64)
+    return Edited(masks, tuple(keys) or (None,) * len(masks), stays, torch.tensor(gone, dtype=torch.int64), apart)
 
 
 def label_maps(leaves: Leaves) -> list[np.ndarray]:
@@ -127,38 +145,32 @@ def test_two_masks_of_one_photo_never_show_the_same_pixels() -> None:
     assert same_partition(leaves)
 
 
-def test_a_person_is_right() -> None:
+def test_the_user_is_right() -> None:
     """A mask that is confirmed stays with its instance, though no surface agrees; what was rejected does not return."""
-    row = int(((REGIONS.view_index == 2) & (IDS == 3)).nonzero()[0, 0])
-    matched = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, 1, IDS))
-    origin = matched.origin.clone()
-    origin[row] = Origin.CONFIRMED
-    leaves = choose(replace(matched, origin=origin))
+    row, every = int(((REGIONS.view_index == 2) & (IDS == 3)).nonzero()[0, 0]), torch.arange(len(IDS))
+    matched = matched_of(PROPOSALS, IDS)
+    confirmed = replace(matched_of(PROPOSALS, IDS.where(every != row, 1)), origin=1 + 4 * (every == row))
+    leaves = choose(matched, edited=edit(confirmed))
     stays = leaves.masks.origin == Origin.CONFIRMED
     assert int(stays.sum()) == 1
     partners = leaves.masks.instance_ids == leaves.masks.instance_ids[stays]
     assert leaves.probabilities[int(leaves.masks.instance_ids[stays])] == 1
     assert int(partners.sum()) >= 5
-    rest = torch.arange(len(IDS)) != row
-    gone = PROPOSALS.select(~rest)
-    matched = matched_of(PROPOSALS, IDS[rest], rest.nonzero()[:, 0])
-    without = choose(matched, removed=gone, more=(matched,))
+    without = choose(matched, edited=edit(matched.select(every != row), gone=[row]))
     assert len(without.masks) == len(REGIONS) - 1
     boxes = without.masks.regions.boxes[without.masks.view_index == 2]
     assert not (boxes == REGIONS.boxes[row]).all(1).any()
 
 
 def test_an_edit_that_touches_nothing_changes_nothing() -> None:
-    """Bit for bit, if the candidates without a person are there."""
+    """Bit for bit; what the edited masks are matched to does not matter."""
     matched = matched_of(PROPOSALS, IDS)
-    plain = choose(matched)
-    moved = replace(matched, instance_ids=IDS % 3 + 1)  # what the edited masks are matched to does not matter
-    edited = choose(moved, removed=PROPOSALS.select(IDS < 0), more=(matched,))
+    plain, edited = choose(matched), choose(matched, edited=edit(replace(matched, instance_ids=IDS % 3 + 1)))
     assert plain.probabilities == edited.probabilities
+    assert plain.keys == edited.keys
     assert torch.equal(plain.masks.instance_ids, edited.masks.instance_ids)
     assert torch.equal(plain.masks.match_scores, edited.masks.match_scores)
-    assert torch.equal(plain.masks.regions.labels, edited.masks.regions.labels)
-    assert torch.equal(REGIONS.boxes[plain.masks.regions.labels], plain.masks.regions.boxes)
+    assert torch.equal(plain.masks.proposal, edited.masks.proposal)
 
 
 def test_masks_are_added_where_the_others_show_nothing() -> None:
@@ -171,78 +183,86 @@ def test_masks_are_added_where_the_others_show_nothing() -> None:
     assert add_beside(two, two, CAMERAS).regions.labels.tolist() == two.regions.labels.tolist()
 
 
+def drawn_by_the_user(maps: list[np.ndarray]) -> Masks:
+    drawn = Masks.of(as_regions(maps)[0], origin=Origin.CORRECTED)
+    return replace(drawn, proposal=-1 - drawn.proposal)
+
+
 def test_a_drawn_mask_that_was_matched_to_nothing_shows_the_leaf_that_the_views_say_or_none() -> None:
     square = np.zeros((SIZE, SIZE), np.int64)
     square[2:14, 2:14] = 1
-    corner, _ = as_regions([np.zeros_like(square)] * 2 + [square] + [np.zeros_like(square)] * 3)
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
     matched = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, -1, IDS))
-    matched.origin[row] = Origin.CORRECTED
-    drawn = replace(Masks.of(corner, origin=Origin.CORRECTED), regions=replace(corner, labels=torch.tensor([-1])))
-    leaves = choose(Masks.concatenate((matched, drawn)))
-    of_person = leaves.masks.origin == Origin.CORRECTED
-    assert sorted(leaves.masks.regions.areas[of_person].tolist()) == sorted([144, int(REGIONS.areas[row])])
-    assert leaves.masks.instance_ids[of_person & (leaves.masks.regions.labels == -1)].tolist() == [-1]
+    redrawn = replace(matched, proposal=matched.proposal.clone())
+    redrawn.origin[row], redrawn.proposal[row] = Origin.CORRECTED, -2
+    drawn = drawn_by_the_user([square * (view == 2) for view in range(6)])
+    leaves = choose(matched_of(PROPOSALS, IDS), edited=edit(Masks.concatenate((redrawn, drawn)), gone=[row]))
+    of_user = leaves.masks.origin == Origin.CORRECTED
+    assert sorted(leaves.masks.regions.areas[of_user].tolist()) == sorted([144, int(REGIONS.areas[row])])
+    assert leaves.masks.instance_ids[leaves.masks.proposal == -1].tolist() == [-1]
     assert same_partition(leaves)
 
 
-def said_of(row: int, ids: torch.Tensor = IDS) -> Masks:
-    """All proposals matched, and a person spoke of one."""
-    matched = matched_of(PROPOSALS, ids)
-    return replace(matched, is_linked=torch.arange(len(IDS)) == row)
-
-
-def test_what_is_said_of_a_leaf_that_stays_as_it_was_seen_changes_no_other_mask() -> None:
+def test_edits_about_a_leaf_that_stays_as_it_was_change_no_other_mask() -> None:
     """Bit for bit, but that the mask is certain now, and the leaf."""
-    plain = choose(matched_of(PROPOSALS, IDS))
-    moved = said_of(3, IDS % 3 + 1)
-    same = choose(moved, removed=PROPOSALS.select(IDS < 0), more=(matched_of(PROPOSALS, IDS),), previous=IDS)
-    said = same.masks.regions.labels == 3
-    (leaf,) = same.masks.instance_ids[said].tolist()
-    assert torch.equal(plain.masks.regions.labels, same.masks.regions.labels)
-    assert torch.equal(plain.masks.instance_ids, same.masks.instance_ids)
-    assert torch.equal(plain.masks.match_scores.where(~said, 1.0), same.masks.match_scores)
-    assert {**plain.probabilities, leaf: 1.0} == same.probabilities
-    assert same.masks.is_linked.tolist() == said.tolist()
+    matched = matched_of(PROPOSALS, IDS)
+    plain = choose(matched)
+    keys = [key for leaf in IDS.tolist() for key in plain.keys.values() if key[0] == int((leaf == IDS).nonzero()[0, 0])]
+    said = replace(matched, instance_ids=IDS % 3 + 1, is_linked=torch.arange(len(IDS)) == 3)
+    same = choose(matched, edited=edit(said, keys=keys))
+    is_said = same.masks.proposal == 3
+    (leaf,) = same.masks.instance_ids[is_said].tolist()
+    scores = {row: score for row, score in zip(plain.masks.proposal.tolist(), plain.masks.match_scores, strict=True)}
+    for row, score in zip(same.masks.proposal.tolist(), same.masks.match_scores, strict=True):
+        assert score == (1 if row == 3 else scores[row])
+    assert same.probabilities[leaf] == 1
+    assert same_partition(same)
+    assert {key: plain.probabilities[number] for number, key in plain.keys.items() if key != same.keys[leaf]} == {
+        key: same.probabilities[number] for number, key in same.keys.items() if number != leaf
+    }
+    assert same.masks.is_linked.tolist() == is_said.tolist()
 
 
 def test_a_cut_mask_of_a_leaf_that_stays_as_it_was_seen_stays_in_it() -> None:
-    """A person confirms a mask that was cut since it was proposed, and that no other matching has."""
+    """The user confirms a mask that was cut since it was proposed, and that no other matching has."""
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
     x1, y1, x2, y2 = REGIONS.boxes[row].tolist()
     maps = [labels.copy() for labels in TRUE]
     maps[2][y1 : (y1 + y2) // 2, x1 : (x1 + x2) // 2][maps[2][y1 : (y1 + y2) // 2, x1 : (x1 + x2) // 2] == 2] = 0
     first = matched_of(PROPOSALS, IDS)
-    cut = replace(first, regions=replace(as_regions(maps)[0], labels=torch.arange(len(IDS))))
-    cut.origin[row] = Origin.CONFIRMED
-    leaves = choose(cut, removed=PROPOSALS.select(IDS < 0), more=(first,), previous=IDS)
-    assert same_partition(leaves, maps)
+    plain = choose(first)
+    keys = [key for leaf in IDS.tolist() for key in plain.keys.values() if key[0] == int((leaf == IDS).nonzero()[0, 0])]
+    cut = replace(first, regions=as_regions(maps)[0], proposal=first.proposal.clone())
+    cut.origin[row], cut.proposal[row] = Origin.CONFIRMED, -1
+    assert same_partition(choose(first, edited=edit(cut, keys=keys, gone=[row])), maps)
 
 
-def test_a_mask_that_a_person_keeps_apart_from_a_leaf_does_not_return_to_it() -> None:
+def test_a_mask_that_the_user_keeps_apart_from_a_leaf_does_not_return_to_it() -> None:
     """Nor does a copy of it; where no other leaf takes it, it goes."""
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
     other = int(((REGIONS.view_index == 3) & (IDS == 2)).nonzero()[0, 0])
     proposals = Masks.concatenate((PROPOSALS, PROPOSALS.select(torch.tensor([row]))))
+    proposals = replace(proposals, proposal=torch.arange(len(proposals)))
     first = matched_of(proposals, torch.cat((IDS, torch.tensor([-1]))))
     edited = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, -1, IDS))
     edited = replace(edited, is_linked=torch.isin(torch.arange(len(IDS)), torch.tensor([row, other])))
-    leaves = choose(edited, proposals, removed=proposals.select(torch.zeros(len(proposals)) > 0), more=(first,))
-    assert set(leaves.masks.regions.labels.tolist()) == set(range(len(IDS))) - {row}
+    leaves = choose(first, proposals, edited=edit(edited))
+    assert set(leaves.masks.proposal.tolist()) == set(range(len(IDS))) - {row}
     without = [np.where((labels == 2) & (view == 2), 0, labels) for view, labels in enumerate(TRUE)]
     assert same_partition(leaves, without)
 
 
-def test_what_lies_under_a_mask_of_a_person_goes() -> None:
-    """He draws half of a leaf, which is matched to nothing."""
+def test_proposals_under_a_mask_of_the_user_go() -> None:
+    """The user draws half of a leaf, which is matched to nothing."""
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
     half = [
         np.where((labels == 2) & (np.arange(SIZE) < REGIONS.boxes[row, 0::2].float().mean().item()), 1, 0)
         for labels in TRUE
     ]
-    drawn = Masks.of(as_regions([each * (view == 2) for view, each in enumerate(half)])[0], origin=Origin.CORRECTED)
-    matched = matched_of(PROPOSALS, IDS).select(torch.arange(len(IDS)) != row)
-    leaves = choose(Masks.concatenate((matched, drawn)))
+    drawn = drawn_by_the_user([each * (view == 2) for view, each in enumerate(half)])
+    matched = matched_of(PROPOSALS, IDS)
+    rest = matched.select(torch.arange(len(IDS)) != row)
+    leaves = choose(matched, edited=edit(Masks.concatenate((rest, drawn)), gone=[row]))
     here = leaves.masks.select(leaves.masks.view_index == 2).regions
     assert int(here.areas.sum()) == int((here.label_map(2, torch.ones(len(here)), (SIZE, SIZE)) > 0).sum())
 
@@ -283,9 +303,9 @@ def test_cameras_on_one_side_are_said() -> None:
     alike = replace(CAMERAS, R=CAMERAS.R[[0] * 6], t=CAMERAS.t[[0] * 6] + 1e-3 * torch.arange(6)[:, None])
     with warns_of("leaves_seen_from_one_side"):
         leaves = choose(matched_of(PROPOSALS, IDS), cameras=alike)
-    none, more = matched_of(PROPOSALS, torch.full_like(IDS, -1)), (matched_of(PROPOSALS, IDS),)
+    none = matched_of(PROPOSALS, torch.full_like(IDS, -1))
     with pytest.warns(InputWarning, match="from one side only"):  # also where nothing was matched after an edit
-        edited = choose(none, cameras=alike, removed=PROPOSALS.select(IDS < 0), more=more)
+        edited = choose(matched_of(PROPOSALS, IDS), cameras=alike, edited=edit(none))
     assert leaves.surfaces == edited.surfaces == {}
     assert torch.equal(leaves.masks.instance_ids, edited.masks.instance_ids)
     assert len(leaves.masks) == len(REGIONS)
@@ -307,8 +327,8 @@ def test_nearly_the_same_masks_are_one_candidate(number: int, is_new: bool) -> N
     square = np.zeros((SIZE, SIZE), np.int64)
     square[:10, :10] = 1
     table = proposals_of(as_regions([square] * 20)[0], torch.full((20,), 0.8))
-    found = [(matched_of(table, torch.where(torch.arange(20) < n, 1, -1)), torch.arange(20)) for n in (20, number)]
-    candidates = gather_candidates(found, None, table=table, is_held=torch.zeros(20, dtype=torch.bool))
+    found = [matched_of(table, torch.where(torch.arange(20) < n, 1, -1)) for n in (20, number)]
+    candidates = gather_candidates(found, [torch.arange(20)] * 2, table=table, fit=None, cameras=CAMERAS)
     assert len(candidates) == 1 + is_new
 
 
@@ -324,10 +344,10 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
     every = Masks.concatenate([Masks.of(as_regions(each)[0]) for each in masks]).regions
     proposals = proposals_of(every, torch.full((len(every),), 0.8))
     matched = matched_of(proposals, torch.arange(1, 4).repeat_interleave(len(cameras)))
-    no_edits = torch.zeros(len(every), dtype=torch.bool)
-    found = [(matched, matched.regions.labels)]
-    stem = gather_candidates(found, cameras, table=proposals, is_held=no_edits).stem
-    leaves = choose_leaves(matched, proposals, cameras=cameras)
+    judges = Judges(cameras)
+    rows = [matched.proposal]
+    stem = gather_candidates([matched], rows, table=proposals, fit=judges.fit, cameras=cameras).stem
+    leaves = choose_leaves(proposals, [matched], judges)
     is_stem_told = max(half_widths) > 0.2
     assert not stem[:2].any()
     assert stem[2] > 0.9 if is_stem_told else stem[2] == 0
@@ -336,7 +356,7 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
 
 def test_clear_leaves_are_what_others_are_held_against() -> None:
     """Of three of which the views show 0.55, 0.75 and 0.85, the last two."""
-    candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros((2, 3), bool), stem=np.zeros(3))
+    candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros(3), np.zeros(3, np.int64))
     best, sure = np.array([[0.55, 0.75, 0.85]] * 3), np.array([[0.2, 1.2, 1.6]] * 3)
     features, clear = leaf_features(candidates, best, sure, share=np.ones((3, 3)), clear=None)
     assert clear.score == pytest.approx(1.4)
@@ -347,29 +367,6 @@ def test_nothing_is_an_answer() -> None:
     empty = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
     assert len(choose(empty, empty).masks) == 0
     assert len(choose(matched_of(PROPOSALS, -torch.ones_like(IDS))).masks) == 0
-
-
-def test_cut_masks_are_more_than_the_proposals_that_they_come_from() -> None:
-    """Two parts of a mask that showed two leaves."""
-    row = int(((REGIONS.view_index == 0) & (IDS == 1)).nonzero()[0, 0])
-    maps = [labels.copy() for labels in TRUE]
-    maps[0][maps[0] == 2] = 1
-    joined, numbers = as_regions(maps)
-    proposals = proposals_of(joined, torch.full((len(joined),), 0.8))
-    global TRUTH
-    TRUTH = numbers
-    try:
-        both = int(((joined.view_index == 0) & (numbers == 1)).nonzero()[0, 0])
-        cut = replace(REGIONS, labels=torch.tensor([
-            both if view == 0 and leaf < 3 else int(((joined.view_index == view) & (numbers == leaf)).nonzero()[0, 0])
-            for view, leaf in zip(REGIONS.view_index.tolist(), IDS.tolist(), strict=True)
-        ]))  # fmt: skip
-        matched = Masks.of(cut, IDS, torch.full((len(IDS),), 0.9), detection_scores=torch.full((len(IDS),), 0.8),
-                           origin=Origin.DETECTED)  # fmt: skip
-        assert row >= 0
-        assert same_partition(choose(matched, proposals))
-    finally:
-        TRUTH = IDS
 
 
 def test_the_best_expected_f1() -> None:

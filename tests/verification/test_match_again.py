@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 from torch import Tensor
@@ -13,8 +11,8 @@ from matched import matched
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import Regions
-from mvseg.verification.checked_ids import check_ids
 from three_leaves import CAMERAS, LEAVES, true_maps
+from verified import verify_ids
 
 SURFACES = {1: LEAVES[1], 3: LEAVES[3]}
 
@@ -39,25 +37,21 @@ def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions,
     regions, leaves, ids = scattered
     is_second = leaves == 2
     masks = unsure(regions, ids, is_second)
-    found = check_ids(masks, SURFACES, cameras=CAMERAS)
-    assert torch.equal(found.instance_ids, torch.where(is_second, 4, ids))
+    found = verify_ids(masks, SURFACES, cameras=CAMERAS)
+    expected = torch.where(is_second, 2, ids)
+    assert torch.equal(found.instance_ids[:, None] == found.instance_ids, expected[:, None] == expected)
     assert torch.equal(found.match_scores[~is_second], masks.match_scores[~is_second])
     assert found.match_scores[is_second].min() > 0.5
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(3))
-    again = check_ids(masks.select(order), SURFACES, cameras=CAMERAS)
+    again = verify_ids(masks.select(order), SURFACES, cameras=CAMERAS)
     assert torch.equal(again.instance_ids, found.instance_ids[order])
 
 
-@pytest.mark.parametrize("reason", ["held", "another method"])
-def test_other_masks_stay(scattered: tuple[Regions, Tensor, Tensor], reason: str) -> None:
+def test_another_method_is_final(scattered: tuple[Regions, Tensor, Tensor]) -> None:
     regions, leaves, ids = scattered
-    is_second = leaves == 2
-    masks = unsure(regions, ids, is_second)
-    if reason == "held":
-        masks = replace(masks, is_linked=is_second)
-    config = MatchConfig(num_instances=3) if reason == "another method" else MatchConfig()
-    found = check_ids(masks, SURFACES, cameras=CAMERAS, config=config)
-    assert torch.equal(found.instance_ids, ids)
+    masks = unsure(regions, ids, leaves == 2)
+    found = verify_ids(masks, SURFACES, cameras=CAMERAS, config=MatchConfig(num_instances=3))
+    assert torch.equal(found.instance_ids[:, None] == found.instance_ids, ids[:, None] == ids)
 
 
 def test_a_mask_joins_the_leaf_that_it_shows_or_stays() -> None:
@@ -69,6 +63,6 @@ def test_a_mask_joins_the_leaf_that_it_shows_or_stays() -> None:
     regions, leaves = as_regions(maps)
     is_wrong = (leaves == 13) | ((leaves == 2) & (regions.view_index == 0))
     ids = torch.where(leaves == 13, 3, torch.where(is_wrong, 1, leaves))
-    found = check_ids(unsure(regions, ids, is_wrong), LEAVES, cameras=CAMERAS)
+    found = verify_ids(unsure(regions, ids, is_wrong), LEAVES, cameras=CAMERAS)
     assert torch.equal(found.instance_ids, torch.where(leaves == 13, 3, leaves))
     assert found.match_scores[leaves == 13].tolist() == [0.5]

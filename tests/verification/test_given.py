@@ -16,12 +16,13 @@ from matched import matched
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
-from mvseg.verification.checked_ids import check_ids, find_moves
+from mvseg.verification.choose import Edited
 from three_leaves import CAMERAS, LEAVES, true_maps
+from verified import verify_ids
 
 
 def check(regions: Regions, ids: Tensor, surfaces: dict[int, LeafSurface] = LEAVES) -> Masks:
-    return check_ids(matched(regions, ids).masks, surfaces, cameras=CAMERAS)
+    return verify_ids(matched(regions, ids).masks, surfaces, cameras=CAMERAS)
 
 
 def is_moved(before: Tensor, after: Masks) -> Tensor:
@@ -53,7 +54,7 @@ def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor
     wrong[one], wrong[other] = 2, 1
     scores = torch.full((len(ids),), 0.9)
     scores[one], scores[other] = 0.1, 0.2
-    checked = check_ids(matched(regions, wrong, scores).masks, LEAVES, cameras=CAMERAS)
+    checked = verify_ids(matched(regions, wrong, scores).masks, LEAVES, cameras=CAMERAS)
     assert torch.equal(checked.instance_ids, ids)
     assert is_moved(wrong, checked).nonzero()[:, 0].tolist() == sorted([one, other])
     is_swapped = is_moved(wrong, checked)
@@ -66,7 +67,7 @@ def test_few_views_do_not_overrule_a_sure_match(num_views: int, is_certain: bool
     regions, leaves = as_regions(true_maps()[:num_views])
     ids = leaves.clone()
     ids[place_of(regions, leaves, 2, 1)], ids[place_of(regions, leaves, 2, 2)] = 2, 1
-    checked = check_ids(matched(regions, ids).masks, LEAVES, cameras=CAMERAS[list(range(num_views))])
+    checked = verify_ids(matched(regions, ids).masks, LEAVES, cameras=CAMERAS[list(range(num_views))])
     assert torch.equal(checked.instance_ids, ids if is_certain else leaves)
 
 
@@ -112,9 +113,12 @@ def test_a_mask_that_the_user_keeps_apart_from_a_leaf_does_not_return_to_it(
     wrong, row = ids.clone(), place_of(regions, ids, 4, 2)
     wrong[row] = -1
     masks = matched(regions, wrong).masks
-    masks = replace(masks, is_linked=(torch.arange(len(ids)) == row) & is_linked)
-    checked = check_ids(masks, LEAVES, cameras=CAMERAS)
-    assert torch.equal(checked.instance_ids, wrong if is_linked else ids)
+    both = torch.tensor([row, place_of(regions, ids, 3, 2)])
+    edits = replace(masks, is_linked=torch.isin(torch.arange(len(ids)), both) & is_linked)
+    edited = Edited(edits, (None,) * len(ids), ids < 0, torch.zeros(0).long(), torch.zeros(0, 2).long())
+    checked = verify_ids(masks, LEAVES, cameras=CAMERAS, edited=edited).instance_ids
+    expected = wrong if is_linked else ids
+    assert torch.equal(checked[:, None] == checked, expected[:, None] == expected)
 
 
 def test_a_mask_does_not_go_where_another_fits_as_well(scene: tuple[Regions, Tensor]) -> None:
@@ -145,26 +149,3 @@ def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]
     assert torch.equal(check(regions, ids, {}).instance_ids, ids)
     empty, nothing = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
     assert len(check(empty, nothing, {})) == 0
-
-
-def find_moves_slowly(leaf: list[int], to: list[int], views: list[int], q: list[float]) -> list[bool]:
-    """One mask after another: it stays if the leaf that it shows keeps another mask of its view."""
-    is_moved = [new >= 0 and new != old and chance >= 0.5 for old, new, chance in zip(leaf, to, q, strict=True)]
-    while True:
-        kept = {(views[row], leaf[row]) for row in range(len(leaf)) if not is_moved[row]}
-        stay = [row for row in range(len(leaf)) if is_moved[row] and (views[row], to[row]) in kept]
-        if not stay:
-            return is_moved
-        for row in stay:
-            is_moved[row] = False
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_masks_move_where_no_other_mask_of_the_view_stays(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    leaf, to, views = rng.integers(-1, 5, 40), rng.integers(-1, 5, 40), rng.integers(0, 12, 40)
-    q = rng.uniform(size=40)
-    moves = find_moves(leaf, to, views, q=q)
-    assert moves.tolist() == find_moves_slowly(leaf.tolist(), to.tolist(), views.tolist(), q.tolist())
-    assert moves.any()
-    assert not moves.all()

@@ -1,0 +1,143 @@
+"""Candidates: sets of proposals that may be one leaf, each with its surface and a key of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.masks import Masks
+from mvseg.reconstruction.numbers import TUBE
+from mvseg.reconstruction.stem.tube_evidence import tube_evidence
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+from mvseg.verification.evidence import Bools, Floats, Ints
+from mvseg.verification.numbers import CHOICE
+
+Fit = Callable[[Masks], Mapping[int, LeafSurface]]
+Key = tuple[int, ...]  # of a candidate: the rows of its masks, which never move in the table of proposals
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """K candidates.
+
+    Attributes:
+        surfaces: K, None where the masks of one agree on none.
+        matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
+        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 where no tube was tried (no surface, or not
+            slender).
+        source: (K,) int64, number of the matching that it comes from.
+    """
+
+    surfaces: tuple[LeafSurface | None, ...]
+    matched: Floats
+    stem: Floats
+    source: Ints
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    @cached_property
+    def keys(self) -> tuple[Key, ...]:
+        """K names, which do not depend on any other candidate."""
+        return tuple(tuple(np.flatnonzero(column).tolist()) for column in ~np.isnan(self.matched.T))
+
+    @cached_property
+    def has_surface(self) -> Bools:
+        """(K,)"""
+        return np.array([each is not None for each in self.surfaces], bool)
+
+    @cached_property
+    def is_credible(self) -> Bools:
+        """(K,) those whose surface may hide others."""
+        return np.array([each is not None and each.is_credible for each in self.surfaces], bool)
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """(K,) lengths of the surfaces, world units; NaN for none."""
+        return np.array([np.nan if each is None else each.length for each in self.surfaces], float)
+
+    @cached_property
+    def fits(self) -> Floats:
+        """(K,) median IoU of the surfaces with the masks that they were fitted to; 0.5 for none."""
+        return np.array([0.5 if each is None else float(each.iou.nanmedian()) for each in self.surfaces], float)
+
+    def of_rows(self, source: int) -> Ints:
+        """(D,) the candidate of one matching that has each mask, -1 for none."""
+        own = np.full(len(self.matched), -1)
+        for index in np.flatnonzero(self.source == source).tolist():
+            own[~np.isnan(self.matched[:, index])] = index
+        return own
+
+
+def gather_candidates(
+    matched: Sequence[Masks],
+    rows: Sequence[Tensor],
+    *,
+    table: Masks,
+    fit: Fit | None,
+    cameras: Cameras,
+) -> Candidates:
+    """The instances of each matching; those that an earlier one has, too, once.
+
+    Args:
+        matched: masks of each matching.
+        rows: (D,) int64 of each, their rows in the table.
+        table: R' masks.
+        fit: {instance id: surface} to instances of masks; None: no surfaces.
+    """
+    areas = table.regions.areas.double()
+    shapes: list[LeafSurface | None] = []
+    members: list[Tensor] = []  # rows of the table, of each candidate
+    columns, source = [], []
+    for number, masks in enumerate(matched):
+        ids = masks.instance_ids
+        instances = ids[ids > 0].unique().tolist()
+        new = [each for each in instances if not _is_there(rows[number][ids == each], members, areas)]
+        is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
+        fitted = {} if fit is None else fit(replace(masks, instance_ids=ids.where(is_new, -1)))
+        for each in new:
+            own = ids == each
+            members.append(rows[number][own])
+            surface = fitted.get(each)
+            shapes.append(surface if surface is not None and surface.exists else None)
+            columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))
+            columns[-1][members[-1]] = masks.match_scores[own].double()
+            source.append(number)
+    if not columns:
+        return Candidates((), np.zeros((len(table), 0)), np.zeros(0), np.zeros(0, np.int64))
+    stem = _stem_chances(shapes, members, table.regions, cameras)
+    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), stem, np.array(source))
+
+
+def _stem_chances(
+    surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
+) -> Floats:
+    stem = np.zeros(len(surfaces))
+    if not any(each is not None for each in surfaces):
+        return stem
+    ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
+    tubes = tube_evidence(
+        regions.select(torch.cat(list(members))),
+        ids,
+        cameras,
+        surfaces={number: each for number, each in enumerate(surfaces, start=1) if each is not None},
+        least_aspect=TUBE.least_aspect,
+    )
+    for number, evidence in tubes.items():
+        stem[number - 1] = evidence.probability
+    return stem
+
+
+def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
+    for others in members:
+        common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
+        if common > CHOICE.same * either:
+            return True
+    return False
