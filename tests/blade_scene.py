@@ -45,11 +45,7 @@ class EllipticBlade:
 
 
 def ring_cameras(
-    num_views: int,
-    *,
-    distance: float = 6.0,
-    elevations_deg: tuple[float, ...] = (25, 60, 40),
-    arc_deg: float = 360,
+    num_views: int, *, distance: float = 6.0, elevations_deg: tuple[float, ...] = (25, 60, 40), arc_deg: float = 360
 ) -> Cameras:
     """Cameras around and above the origin, at changing heights."""
     rotations, centers = [], []

@@ -213,10 +213,7 @@ def leaf_metrics_reference(
 ) -> dict[str, float]:
     """Precision and recall of masks, pair F1 over all true masks and MV-PQ, from sets of pixels.
 
-    Args:
-        masks: view and (H, W) bool mask of each region.
-        ids: of each region, -1 = none.
-        truth: a true label map per view, 0 = nothing, 65535 = ignore.
+    `masks` are (view, (H, W) bool); -1 = no id; in `truth`, 0 = nothing, 65535 = ignore.
     """
 
     def pixels(view: int, mask: np.ndarray) -> set[tuple[int, int, int]]:

@@ -17,16 +17,8 @@ ROUNDED = ("match_scores", "detection_scores", "probabilities")  # result folder
 def assert_same_result(first: Result, second: Result, *, relative: float = 1e-5, absolute: float = 1e-4) -> None:
     """Check that two results say the same: of the scene, of each mask and instance, and of the run's outcome.
 
-    Masks are compared pixel by pixel and row by row. Not compared: photos and their places, times, versions and
-    options, `starts` of the instances and the candidates `left` out.
-
-    Args:
-        first, second: the results.
-        relative: tolerance of traits, cameras and shapes, as a share of the number; of matrices, of the largest one.
-        absolute: tolerance of what is `ROUNDED`.
-
-    Raises:
-        AssertionError: they differ; the message is the first difference.
+    Not compared: photos and their places, times, versions, options, `starts` and the candidates `left` out. `relative`
+    is for traits, cameras and shapes (of matrices: of the largest number), `absolute` for what is `ROUNDED`.
     """
     compared = describe(first), describe(second)
     for what, value in compared[0].items():

@@ -19,17 +19,8 @@ def simulate_proposals(
     """Several proposals of every visible instance.
 
     Each copy is the true mask, scaled and shifted so that the edges of its box move by a normal error of `jitter` of
-    the box's side, and eroded or dilated by up to two pixels. Scores fall with the error, and small regions score less,
-    as half-hidden leaves do.
-
-    Args:
-        label_maps: V integer arrays (H, W), 0 = nothing, every other number one instance of the view.
-        seed: of everything that is random.
-        copies: proposals of each instance.
-        jitter: standard deviation of each edge, as a share of the side of the box.
-
-    Returns:
-        The R proposals, and (R,) int64, the label that each was made from.
+    the box's side, and eroded or dilated by up to two pixels. Scores fall with the error, and for small regions.
+    Returns the proposals and (R,) the label that each was made from.
     """
     rng = np.random.default_rng(seed)
     truth = regions_from_label_maps(label_maps)

@@ -14,21 +14,13 @@ from mvseg.scene import Cameras
 
 @dataclass(frozen=True, eq=False)
 class BallScene:
-    """Balls seen by cameras.
-
-    Attributes:
-        cameras: V cameras.
-        centers: (K, 3) world positions.
-        radii: (K,).
-        label_maps: V arrays (H, W), 0 = nothing, k + 1 = the nearest ball is k.
-        regions: the visible parts; `regions.labels - 1` is the ball.
-    """
+    """Balls seen by cameras."""
 
     cameras: Cameras
-    centers: Tensor
+    centers: Tensor  # (K, 3)
     radii: Tensor
-    label_maps: list[np.ndarray]
-    regions: Regions
+    label_maps: list[np.ndarray]  # (H, W), 0 = nothing, k + 1 = the nearest ball is k
+    regions: Regions  # the visible parts; labels - 1 is the ball
 
 
 def look_at(position: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,10 +21,7 @@ from mvseg import (
     run_scene,
 )
 from mvseg.errors import InputError
-from mvseg.masks import Masks
-from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions
-from mvseg.results.result import Result
 from mvseg.scene import Scene
 
 
@@ -60,12 +57,3 @@ def test_arguments_of_another_class_are_refused(
 def test_a_choice_that_there_is_not_is_refused(make: Callable[[], object], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
-
-
-def test_printed_a_table_is_a_line(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
-    masks = Masks.of(demo_regions, demo_truth)
-    assert repr(demo_scene) == "Scene('demo_plant', 9 views, unit mm)"
-    assert repr(demo_scene.cameras) == "Cameras(9 views: 640 x 480)"
-    assert repr(demo_regions) == "Regions(108 masks in 9 views)"
-    assert repr(masks) == "Masks(108 in 9 views, of 12 instances)"
-    assert len(str(Result(demo_scene, Matching(masks, MatchReport("nview")))).splitlines()) == 4

@@ -72,13 +72,6 @@ def move_every_second(index: int, entry: dict[str, Any]) -> None:
     entry["t"] = (np.array(entry["t"]) * (1.2 if index % 2 == 0 else 1)).tolist()
 
 
-def test_two_worlds_are_an_error(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit_cameras(plant, move_every_second)
-    assert main(["check", str(plant), "--masks", "masks", "--quiet"]) == 1
-    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("error")]
-    assert "4 views (001, 003, 005 and 1 more)" in line
-
-
 def test_a_run_warns_of_it(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     edit_cameras(plant, move_every_second)
     monkeypatch.setattr("mvseg.pipeline.run_scene.measure", lambda result, *_: result)  # no shape is looked at
@@ -117,11 +110,6 @@ def test_masks_that_cannot_be_read_come_after_what_can(plant: Path, capsys: pyte
     assert "no problems found" not in captured.out
     assert captured.err.startswith("mvseg: error: ")
     assert "64 x 48" in captured.err
-
-
-def test_no_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check", str(tmp_path / "nothing"), "--quiet"]) == 2
-    assert capsys.readouterr().err == f"mvseg: error: {tmp_path / 'nothing'}: no such scene folder\n"
 
 
 def test_from_python(demo_scene: Scene, demo_regions: Regions) -> None:

@@ -31,13 +31,13 @@ from mvseg.errors import InputWarning, warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.run_lengths import encode_mask
-from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
 NAN = float("nan")
+Said, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
 # for tests that look at no shape and at no page
 COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--report", "false"]
 SMALL = ["--detect.image_size", "128"]  # for those that look at no detection: one size, and as large as the photos are
@@ -58,9 +58,6 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     assert captured.err.startswith("mvseg: error: ")
     assert "Traceback" not in captured.err
     return captured.err.removeprefix("mvseg: error: ").rstrip("\n")
-
-
-# --- The shipped scene ----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -184,9 +181,6 @@ def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert metrics["no_instance"] <= 6
 
 
-# --- Options --------------------------------------------------------------------------------------
-
-
 def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = tmp_path / "run.yaml"
     config.write_text(
@@ -272,9 +266,7 @@ def test_the_page_may_be_left_out(verb: str, plant: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("words", [["up"], ["board"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])
-def test_up_that_is_no_direction(
-    words: list[str], plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_up_that_is_no_direction(words: list[str], plant: Path, tmp_path: Path, capsys: Said) -> None:
     out = ["--out", str(tmp_path / "out"), "--quiet"]
     assert main(["infer", str(plant), "--masks", "masks", "--up", *words, *out]) == 2
     assert complaint(capsys).startswith("--up is ")
@@ -290,13 +282,6 @@ def test_the_papers_config_serves_both_verbs(plant: Path, tmp_path: Path) -> Non
         assert json.loads((folder / "run.json").read_text())["config"]["match"]["method"] == "symnmf"
 
 
-def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["match", str(plant), "--out", str(tmp_path / "out")]) == 0
-    assert "writing pictures: view 4 of 4" in capsys.readouterr().err
-    assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert capsys.readouterr().err == ""
-
-
 def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Every stage that takes minutes on a large scene has a bar, matching between detections and shapes too."""
     plant = write_scene(tmp_path / "plant", 3)
@@ -309,9 +294,7 @@ def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "plant"]
 
 
-def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(tmp_path: Path, capsys: Said) -> None:
     plant, unverified = write_scene(tmp_path / "plant", 2), [*COARSE, *SMALL, "--detect.verify", "false"]
     kept, said = tmp_path / "out.detections", "mvseg: going on from the detections in"
     kept.mkdir()
@@ -321,13 +304,6 @@ def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
         assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *unverified]) == 0
         assert (f"{said} {kept}, for equal photos and options" in capsys.readouterr().err) == holds_some
         assert not kept.exists()
-
-
-def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
-    (plant / "masks").rename(tmp_path / "elsewhere")
-    arguments = ["match", str(plant), "--masks", str(tmp_path / "elsewhere"), "--out", str(tmp_path / "out"), "--quiet"]
-    assert main(arguments) == 0
-    assert (tmp_path / "out" / "plant" / "labels" / "003.png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -408,17 +384,12 @@ def test_help_fits_a_screen(verb: str, capsys: pytest.CaptureFixture[str], monke
 
 
 @pytest.mark.parametrize(("script", "option"), [("infer.py", "--masks"), ("train.py", "--photos")])
-def test_scripts_of_the_checkout_are_verbs(
-    script: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_scripts_of_the_checkout_are_verbs(script: str, option: str, monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.setattr(sys, "argv", [script, "--help"])
     with pytest.raises(SystemExit) as stop:
         runpy.run_path(str(ROOT / script), run_name="__main__")
     assert stop.value.code == 0
     assert option in capsys.readouterr().out
-
-
-# --- Several scenes -------------------------------------------------------------------------------
 
 
 def test_match_takes_several_scenes(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -434,9 +405,7 @@ def test_match_takes_several_scenes(plant: Path, tmp_path: Path, capsys: pytest.
     assert json.loads((out / "other" / "run.json").read_text())["scene"] == "other"
 
 
-def test_a_broken_scene_does_not_stop_the_others(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_broken_scene_does_not_stop_the_others(plant: Path, tmp_path: Path, capsys: Said) -> None:
     broken = write_scene(tmp_path / "broken")
     (broken / "masks" / "001.png").unlink()
     assert main(["match", str(broken), str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
@@ -453,19 +422,8 @@ def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pyt
     assert not (tmp_path / "out").exists()
 
 
-# --- Not errors -----------------------------------------------------------------------------------
-
-
-def test_masks_only(tmp_path: Path) -> None:
-    plant = write_scene(tmp_path / "plant", images=False)
-    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *COARSE]) == 0
-    assert len(list((tmp_path / "out" / "overlay").iterdir())) == 4
-
-
 @pytest.mark.parametrize("verb", ["infer", "match"])
-def test_two_cameras_that_share_a_centre(
-    verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_cameras_that_share_a_centre(verb: str, plant: Path, tmp_path: Path, capsys: Said) -> None:
     same = json.loads((plant / "cameras.json").read_text())["views"][0]
     edit_rig(plant, 1, R=same["R"], t=same["t"])
     for kind in ("images", "masks"):
@@ -502,9 +460,6 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
         assert not trimesh.load_scene(out / "scene.glb").geometry
         assert list((out / "leaves").iterdir()) == []
     assert main(["eval", str(out), "--truth", str(plant / "masks")]) == 0
-
-
-# --- Bad input ------------------------------------------------------------------------------------
 
 
 def rig(view: int | None = None, **changes: Any) -> Break:
@@ -585,19 +540,8 @@ def test_bad_input(name: str, plant: Path, tmp_path: Path, capfd: pytest.Capture
     assert sorted(tmp_path.rglob("*")) == before  # no result, and nothing half of one
 
 
-def test_the_same_scene_whole_is_fine(plant: Path, tmp_path: Path) -> None:
-    """The builders of the table above are sound when nothing is broken."""
-    shutil.copytree(plant, tmp_path / "colmap")
-    colmap()(tmp_path / "colmap")
-    coco(json.dumps({"images": IMAGES, "annotations": []}))(plant)
-    for scene, masks in ((plant, "masks"), (tmp_path / "colmap", "masks"), (plant, "masks.json")):
-        load_masks(load_scene(scene), scene / masks)
-
-
 @pytest.mark.parametrize("place", ["file", "file/below", "full"])
-def test_output_that_cannot_be_written(
-    place: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_output_that_cannot_be_written(place: str, plant: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
@@ -648,9 +592,7 @@ def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
     assert list((tmp_path / "out").rglob("*")) == []
 
 
-def test_masks_are_looked_for_in_two_places(
-    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_masks_are_looked_for_in_two_places(plant: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copytree(plant / "masks", tmp_path / "annotations")
     assert main(["match", str(plant), "--masks", "annotations", "--out", "one", "--quiet"]) == 0
@@ -661,12 +603,7 @@ def test_masks_are_looked_for_in_two_places(
     assert main(["match", str(plant), "--masks", str(tmp_path / "annotations"), "--out", "two", "--quiet"]) == 0
 
 
-# --- What the user is told ------------------------------------------------------------------------
-
-
-def test_an_earlier_result_is_not_replaced_in_silence(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_earlier_result_is_not_replaced_in_silence(plant: Path, tmp_path: Path, capsys: Said) -> None:
     arguments = ["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]
     assert main(arguments) == 0
     assert capsys.readouterr().out.endswith("in 4 views\n")
@@ -738,9 +675,7 @@ def test_a_scene_is_called_as_its_link(plant: Path, tmp_path: Path, monkeypatch:
 
 
 @pytest.mark.parametrize("verb", ["infer", "match", "batch", "pose"])
-def test_an_output_that_links_to_itself(
-    verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_output_that_links_to_itself(verb: str, plant: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "self").symlink_to("self")
     given = {"pose": plant / "images", "batch": tmp_path}.get(verb, plant)
     assert main([verb, str(given), "--out", str(tmp_path / "self"), "--quiet"]) == 2
@@ -748,9 +683,7 @@ def test_an_output_that_links_to_itself(
     assert said.endswith("its links form a loop, expected a folder or a new name")
 
 
-def test_a_full_disk_while_detecting_is_named(
-    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_while_detecting_is_named(plant: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     def fill(path: Path, content: bytes) -> int:
         if ".safetensors." in path.name:
             raise OSError(28, "No space left on device")
@@ -763,9 +696,7 @@ def test_a_full_disk_while_detecting_is_named(
     assert re.fullmatch(rf"{tmp_path}/out\.detections/[0-9a-f]{{64}}\.safetensors: No space left on device", said)
 
 
-def test_masks_that_show_no_true_leaf_are_counted(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_masks_that_show_no_true_leaf_are_counted(plant: Path, tmp_path: Path, capsys: Said) -> None:
     out, truth = tmp_path / "out", tmp_path / "truth"
     assert main(["match", str(plant), "--out", str(out), "--quiet"]) == 0
     shutil.copytree(plant / "masks", truth)
@@ -795,9 +726,7 @@ def test_two_annotators_are_compared(plant: Path, tmp_path: Path, capsys: pytest
     assert not (other / "metrics.json").exists()
 
 
-def test_eval_takes_the_folder_that_match_wrote(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_eval_takes_the_folder_that_match_wrote(plant: Path, tmp_path: Path, capsys: Said) -> None:
     out = tmp_path / "out"
     assert main(["match", str(plant), "--out", str(out), "--quiet"]) == 0
     capsys.readouterr()
@@ -844,16 +773,6 @@ def test_categories_are_selected(plant: Path, tmp_path: Path, capsys: pytest.Cap
     assert "there is no category 'pot', expected of these: leaf, flower pot" in complaint(capsys)
 
 
-def test_detect_options_beside_masks_are_warned_of(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet", *COARSE]
-    assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
-    assert "the detect options have no effect" in capsys.readouterr().err
-    findings = json.loads((tmp_path / "out" / "run.json").read_text())["findings"]
-    assert "detect_options_unused" in [each["code"] for each in findings]
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -866,12 +785,13 @@ def test_options_that_do_not_apply_lose_no_run(plant: Path, tmp_path: Path, word
     """A file of weights beside masks, and so on: everything is written, as without them."""
     out = tmp_path / "out"
     assert main(["infer", str(plant), "--masks", "masks", "--out", str(out), "--quiet", *COARSE, *words]) == 0
-    assert not {"detect", "learn"} & json.loads((out / "run.json").read_text())["config"].keys()
+    run = json.loads((out / "run.json").read_text())
+    assert not {"detect", "learn"} & run["config"].keys()
+    is_said = "detect_options_unused" in [each["code"] for each in run["findings"]]
+    assert is_said == any(word.startswith("--detect.") for word in words)
 
 
-def test_a_repeated_warning_is_given_once(
-    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_repeated_warning_is_given_once(plant: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     def warn_twice(*args: Any, **options: Any) -> Matching:
         for _ in range(2):
             warn(Finding("one_number", "look here"))
@@ -904,9 +824,7 @@ def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureF
     assert "is a file, expected the scene's folder" in complaint(capsys)
 
 
-def test_simulate_says_what_it_needs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_simulate_says_what_it_needs(tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     for name in [name for name in sys.modules if name.startswith(("embreex", "mvseg.simulation"))]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "embreex", None)
@@ -914,9 +832,7 @@ def test_simulate_says_what_it_needs(
     assert "pip install 'mvseg[simulate]'" in complaint(capsys)
 
 
-def test_metrics_are_written_in_place_of_a_link_and_stay(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_metrics_are_written_in_place_of_a_link_and_stay(plant: Path, tmp_path: Path, capsys: Said) -> None:
     """A link must not lead to somebody else's file; and what `eval` writes belongs to the user from then on."""
     precious, out = tmp_path / "precious", tmp_path / "out" / "plant"
     precious.write_text("mine")
@@ -949,18 +865,14 @@ def test_names_in_a_result_do_not_lead_out_of_the_truth(
 
 
 @pytest.mark.parametrize("name", ["RANK", "WORLD_SIZE", "LOCAL_RANK"])
-def test_an_environment_that_torchrun_did_not_set(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_environment_that_torchrun_did_not_set(name: str, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.setenv(name, "abc")
     folders = [f"--{option}={tmp_path}" for option in ("photos", "labels", "output")]
     assert main(["train", *folders]) == 2
     assert complaint(capsys) == f"the environment variable {name} is 'abc', expected a number as torchrun sets it"
 
 
-def test_too_little_memory_is_one_sentence(
-    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_too_little_memory_is_one_sentence(plant: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     def fail(*_: object, **__: object) -> None:
         raise MemoryError
 
@@ -978,9 +890,7 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     assert capsys.readouterr().err == "mvseg: interrupted\n"
 
 
-def test_an_interruption_that_a_library_makes_another_error_of(
-    monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_interruption_that_a_library_makes_another_error_of(monkeypatch: Patch, plant: Path, capsys: Said) -> None:
     def stop(*_: object, **__: object) -> None:
         try:
             raise KeyboardInterrupt
@@ -1040,9 +950,7 @@ def test_a_warning_is_one_line(plant: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 @pytest.mark.parametrize(("given", "expected"), [(["--num_workers", "3"], 3), ([], 4)])
-def test_infer_fits_in_so_many_processes(
-    given: list[str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_infer_fits_in_so_many_processes(given: list[str], expected: int, tmp_path: Path, monkeypatch: Patch) -> None:
     asked: list[int] = []
     monkeypatch.setattr("mvseg.system.worker_pool.default_workers", lambda: 4)
     monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", lambda *_, num_workers, **__: asked.append(num_workers))

@@ -119,10 +119,7 @@ def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: 
     place = out / "plant"
     coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--out", str(place), "--quiet"]
     coarse += ["--overwrite", "true"]  # the earlier result is of another folder
-    run = {
-        "infer": ["infer", str(plant), "--masks", "masks", *coarse],
-        "detect": ["infer", str(plant), *coarse],
-    }[verb]
+    run = {"infer": ["infer", str(plant), "--masks", "masks", *coarse], "detect": ["infer", str(plant), *coarse]}[verb]
     seconds = runs(run)["seconds"]
     old, new = read_result(earlier), read_result(place)
     assert old != new

@@ -81,12 +81,6 @@ def test_center_projects_to_depth_zero_and_rays_return_to_their_pixel() -> None:
         torch.testing.assert_close(depth[view, 0], torch.tensor(3.0).double())
 
 
-def test_cameras_are_selected_in_the_order_asked_for() -> None:
-    cameras = some_cameras()
-    torch.testing.assert_close(cameras[[2, 0]].centers, cameras.centers[[2, 0]])
-    assert len(cameras[1:3]) == 2
-
-
 @pytest.mark.parametrize(
     ("field", "change", "message"),
     [

@@ -19,7 +19,7 @@ from mvseg.demo import demo_scene
 from mvseg.formats.markers import find_markers, read_grey
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
-from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_corners, tag_distance
+from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_corners
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.result import Result
 from mvseg.runs import check_target
@@ -54,9 +54,6 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     return line.removeprefix("mvseg: error: ")
 
 
-# --- the page
-
-
 def test_areas_are_those_of_the_formulas() -> None:
     """A bent leaf has that of a straight one: what a half gains outside of the arc, the other loses inside (Pappus)."""
     disc, *leaves = list_shapes()
@@ -66,11 +63,6 @@ def test_areas_are_those_of_the_formulas() -> None:
     for leaf, (length, width, base, tip) in zip(leaves, formulas, strict=True):
         half = u**base * (1 - u) ** tip
         assert leaf.area == pytest.approx(length * width * (half / half.max()).mean(), rel=1e-4)
-
-
-def test_the_first_and_the_last_tag_are_as_far_apart_as_said() -> None:
-    first, *_, last = (corners.mean(0) for corners in tag_corners().values())
-    assert tag_distance() == pytest.approx(np.hypot(*(last - first)))
 
 
 def test_nothing_on_the_page_touches_anything_else() -> None:
@@ -111,9 +103,6 @@ def test_another_suffix_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture
     assert list(tmp_path.iterdir()) == []
 
 
-# --- masks by colour
-
-
 @pytest.mark.parametrize("light", [(1.0, 0.9, 0.7), (0.5, 0.6, 0.7)])
 @pytest.mark.parametrize(("shade", "most_wrong"), [(1.0, 0), (0.4, 100)])
 def test_masks_end_where_half_of_the_light_is_ink(
@@ -132,9 +121,6 @@ def test_masks_end_where_half_of_the_light_is_ink(
     assert np.unique(labels).tolist() == [0, 7]
     assert ((labels == 7) != (share[..., 0] > 0.5)).sum() <= most_wrong  # of 11,304 pixels
     assert not cut_shapes(photo, {7: (cell, outline + 100)}).any()  # another thing than the shape
-
-
-# --- the chain
 
 
 @pytest.mark.slow

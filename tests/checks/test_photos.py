@@ -90,10 +90,6 @@ def test_exposures_that_differ_are_noted(tmp_path: Path) -> None:
         assert findings_of(folder) == []
 
 
-def test_sound_photos_have_no_finding(tmp_path: Path) -> None:
-    assert findings_of(write_scene(tmp_path / "plant")) == []
-
-
 @pytest.mark.parametrize(
     ("fault", "level", "views", "code"),
     [

@@ -178,8 +178,7 @@ def test_many_views_are_compared_with_some() -> None:
 
 @pytest.mark.shared_data
 @pytest.mark.parametrize(
-    ("plant", "masks"),
-    [("basil-0729", "masks"), pytest.param("maize-plant1", "silhouettes", marks=pytest.mark.slow)],
+    ("plant", "masks"), [("basil-0729", "masks"), pytest.param("maize-plant1", "silhouettes", marks=pytest.mark.slow)]
 )
 def test_a_turned_camera_of_a_real_plant_is_named(plant: str, masks: str, shared_data: Path) -> None:
     """Measured: 59 to 81 % of a view's masks fit (basil), 100 % (maize); 10 degrees: 19 % and 0 %."""

@@ -19,8 +19,6 @@ from mvseg.detectors.mask_rcnn import (
     build_bare,
     build_detector,
     freeze_norm,
-    list_architectures,
-    list_weight_names,
     make_group_norm,
 )
 from mvseg.detectors.weights_file import Description, encode_weights
@@ -63,12 +61,6 @@ def download(monkeypatch: pytest.MonkeyPatch) -> list[Download]:
 
     monkeypatch.setattr("torchvision.models._api.load_state_dict_from_url", answer)
     return answers
-
-
-def test_architectures() -> None:
-    assert set(list_architectures()) >= {*SMALL, "maskrcnn_resnet50_fpn", "maskrcnn_resnet50_fpn_v2"}
-    assert "COCO_V1" in list_weight_names("maskrcnn_resnet50_fpn_v2")
-    assert "IMAGENET1K_V1" in list_weight_names("resnet18_fpn")
 
 
 @pytest.mark.parametrize("arch", SMALL)

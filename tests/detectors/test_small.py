@@ -12,12 +12,7 @@ from mvseg.detectors.small import build_mask_head
 
 @pytest.mark.parametrize(
     ("arch", "millions"),
-    [
-        ("resnet18_fpn", 14.7),
-        ("mobilenet_v3_large_fpn", 6.5),
-        ("efficientnet_lite0", 6.4),
-        ("efficientnet_lite2", 7.8),
-    ],
+    [("resnet18_fpn", 14.7), ("mobilenet_v3_large_fpn", 6.5), ("efficientnet_lite0", 6.4), ("efficientnet_lite2", 7.8)],
 )
 def test_small_detectors(arch: str, millions: float) -> None:
     torch.manual_seed(0)

@@ -13,7 +13,6 @@ from safetensors.torch import save_file
 import mvseg.detectors.zoo as zoo
 from benchmarks.pack_detector import pack_detector
 from mvseg.cli import main
-from mvseg.detection.config import DetectConfig
 from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.zoo import find_weights, list_detectors, load_detector
 from mvseg.errors import InputError
@@ -60,10 +59,6 @@ def test_photos_are_scaled_down_never_up_unless_a_size_is_asked_for(packed: Path
     model = load_detector("leaf-test")
     with torch.no_grad():
         assert model(photos[1:])[0]["masks"].shape[1:] == (1, 40, 60)
-
-
-def test_the_default_of_infer_ships() -> None:
-    assert [DetectConfig().weights] == SHIPPED
 
 
 def test_a_packed_run_loads_with_its_own_size_and_classes(run: Path, packed: Path) -> None:
@@ -117,11 +112,6 @@ def test_damaged_neighbours_do_not_keep_a_detector_from_loading(
     assert load_detector("leaf-test").transform.max_size == 96
     assert main(["models"]) == 2
     assert "is not a complete detector" in capsys.readouterr().err
-
-
-def test_the_least_score_may_be_given(packed: Path) -> None:
-    assert load_detector("leaf-test").roi_heads.score_thresh == 0.05
-    assert load_detector("leaf-test", min_score=0.4).roi_heads.score_thresh == 0.4
 
 
 def test_loading_leaves_the_random_generator_alone(packed: Path) -> None:

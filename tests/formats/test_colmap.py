@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.formats.colmap import find_colmap_model, is_colmap_model, read_colmap
+from mvseg.formats.colmap import find_colmap_model, read_colmap
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import arc_pose
@@ -101,12 +101,6 @@ def test_radial_without_distortion_is_a_pinhole_but_a_fisheye_is_not(tmp_path: P
     assert by_name["opencv_fisheye/02"].model_name == "OPENCV_FISHEYE"
 
 
-def test_what_is_a_model(small: Path, tmp_path: Path) -> None:
-    assert is_colmap_model(small / "sparse")
-    assert not is_colmap_model(small)
-    assert not is_colmap_model(tmp_path / "absent")
-
-
 def copy_model(small: Path, folder: Path) -> Path:
     shutil.copytree(small, folder)
     return folder / "sparse"
@@ -163,16 +157,6 @@ class TestText:
         ):
             load_scene(folder)
 
-    def test_zero_focal_length(self, folder: Path) -> None:
-        self.replace(folder, "cameras.txt", "PINHOLE 128 96 150 ", "PINHOLE 128 96 0 ")
-        with pytest.raises(InputError, match=r"sparse: view 1 \(images/pinhole/01.jpg\): the focal length is 0, 155"):
-            load_scene(folder)
-
-    def test_absurd_image_size(self, folder: Path) -> None:
-        self.replace(folder, "cameras.txt", "PINHOLE 128 96", "PINHOLE 9999999999 96")
-        with pytest.raises(InputError, match=r"view 1 .*: the image size is 9999999999 x 96, expected at most"):
-            load_scene(folder)
-
     def test_name_that_leads_out(self, folder: Path) -> None:
         self.replace(folder, "images.txt", "pinhole/01.jpg", "../../01.jpg")
         with pytest.raises(InputError, match=r"sparse: view 0 \(images/../../01.jpg\): the file name leads out"):
@@ -197,40 +181,12 @@ class TestText:
             load_scene(folder)
 
 
-def test_single_view(tmp_path: Path) -> None:
-    (tmp_path / "sparse").mkdir()
-    model = build_model(PINHOLES)
-    model.deregister_frame(2)
-    model.write_binary(tmp_path / "sparse")
-    with pytest.raises(InputError, match=r"sparse: there is a single view"):
-        load_scene(tmp_path)
-
-
 @pytest.mark.parametrize("missing", ["images.bin", "points3D.bin"])
 def test_missing_file_of_a_model(missing: str, small: Path, tmp_path: Path) -> None:
     model = copy_model(small, tmp_path / "plant")
     (model / missing).unlink()
     with pytest.raises(InputError, match=r"sparse: cannot be read as a COLMAP model"):
         read_colmap(model, tmp_path)
-
-
-@pytest.mark.shared_data
-def test_a_real_model_reprojects_its_own_points(shared_data: Path) -> None:
-    folder = shared_data / "fern-llff"
-    scene = load_scene(folder)
-    model = pycolmap.Reconstruction(scene.source)
-    points = np.stack([point.xyz for point in model.points3D.values()])
-    order = {number: index for index, number in enumerate(model.points3D)}
-    px, _ = scene.cameras.project(torch.from_numpy(points))
-    for view in range(0, len(scene.views), 7):
-        name = scene.views[view].path.relative_to(folder / "images").as_posix()
-        seen = [point for point in model.find_image_with_name(name).points2D if point.has_point3D()]
-        found = px[view, [order[point.point3D_id] for point in seen]].numpy()
-        lens = scene.views[view].lens
-        if lens is not None:
-            found = photo_from_pinhole(lens, scene.cameras.K[view].numpy(), found)
-        errors = np.linalg.norm(found - np.stack([point.xy for point in seen]), axis=1)
-        assert np.median(errors) < 1.0
 
 
 def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> None:
@@ -240,9 +196,6 @@ def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> Non
     with warns_of("photos_without_pose"):
         scene = read_colmap(model, tmp_path / "plant")
     assert "stranger" not in [view.name for view in scene.views]
-
-
-# --- Several models -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["text", "binary"])

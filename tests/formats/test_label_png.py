@@ -11,7 +11,7 @@ from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png, write_label_png
-from scene_folders import cut_file, write_image
+from scene_folders import write_image
 
 
 def test_round_trip_over_all_16_bits(tmp_path: Path) -> None:
@@ -70,16 +70,3 @@ def test_palette_pngs_give_their_indices(tmp_path: Path) -> None:
         image.putpalette([value for color in range(colors) for value in (color // 2 * 7 % 256, 90, 30)])
         image.save(tmp_path / f"{name}.png", transparency=0)
         np.testing.assert_array_equal(read_label_png(tmp_path / f"{name}.png", 6, 4), labels)
-
-
-def test_missing(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"labels.png: the mask file is missing"):
-        read_label_png(tmp_path / "labels.png", 6, 4)
-
-
-@pytest.mark.parametrize("share", [0, 0.3, 0.7, 0.99])
-def test_cut_short(share: float, tmp_path: Path) -> None:
-    write_label_png(tmp_path / "labels.png", np.arange(2400).reshape(40, 60))
-    cut_file(tmp_path / "labels.png", share)
-    with pytest.raises(InputError, match=r"labels.png: cannot be read, expected a whole label PNG"):
-        read_label_png(tmp_path / "labels.png", 60, 40)

@@ -97,14 +97,6 @@ def test_nothing_to_see() -> None:
     assert find_markers(np.full((80, 80), 128, np.uint8), "5X5_1000") == {}
 
 
-def test_the_boards_world_is_right_handed() -> None:
-    """x and y lie in the board, as one reads it, z comes out of it."""
-    corners = BOARD.corners()
-    assert corners.min(0).tolist() == [40, 40, 0]
-    assert corners.max(0).tolist() == [160, 120, 0]
-    assert corners[0].tolist() == [40, 120, 0]  # OpenCV counts from the top left
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [({"columns": 1}, "1 x 4 squares"), ({"marker": 40.0}, "markers have 40, the squares 40"), ({"square": 0}, "0")],

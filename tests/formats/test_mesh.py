@@ -35,6 +35,7 @@ def test_ply_keeps_shape_place_and_colour(ball: trimesh.Trimesh, tmp_path: Path)
     np.testing.assert_allclose(back.bounds, [[95, -25, -2], [105, -15, 8]], atol=0.3)
     np.testing.assert_allclose(back.bounds, ball.bounds, rtol=1e-6)
     assert (back.visual.vertex_colors == [*RED, 255]).all()
+    assert not ball.visual.defined  # the mesh itself stays uncoloured
     assert (back.metadata["_ply_raw"]["vertex"]["data"]["instance_id"] == 12).all()
 
 
@@ -72,11 +73,6 @@ def test_meshes_stay_whole_far_from_the_origin(tmp_path: Path) -> None:
                                leaf.vertices, atol=1e-8)  # fmt: skip
     few, few_moved = simplify_mesh(leaf, 300), simplify_mesh(moved, 300)
     assert few_moved.area == pytest.approx(few.area, rel=1e-3)
-
-
-def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
-    write_ply(tmp_path / "leaf.ply", ball, RED, instance_id=1)
-    assert not ball.visual.defined
 
 
 def test_glb_places_the_world_and_says_what_was_measured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
@@ -130,9 +126,3 @@ def test_all_normals_in_a_glb_are_unit_vectors(tmp_path: Path) -> None:
     write_glb(tmp_path / "scene.glb", {"leaf_001": sides}, {"leaf_001": RED})
     (shown,) = trimesh.load_scene(tmp_path / "scene.glb", process=False).geometry.values()
     np.testing.assert_allclose(np.linalg.norm(shown.vertex_normals, axis=1), 1, atol=1e-6)
-
-
-def test_glb_without_meshes_is_a_valid_file(tmp_path: Path) -> None:
-    write_glb(tmp_path / "scene.glb", {}, {})
-    assert (tmp_path / "scene.glb").read_bytes()[:4] == b"glTF"
-    assert not trimesh.load_scene(tmp_path / "scene.glb").geometry

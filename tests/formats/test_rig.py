@@ -16,7 +16,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.rig import read_rig, write_rig
 from mvseg.scene import Scene
-from scene_folders import BALLS, HEIGHT, WIDTH, arc_pose, edit_rig, rig_content, write_scene
+from scene_folders import BALLS, arc_pose, edit_rig, rig_content, write_scene
 
 DISTORTION = [-0.2, 0.05, 0.001, -0.002, 0.01]
 
@@ -29,17 +29,6 @@ def write(folder: Path, content: Any) -> Path:
 
 def read(folder: Path, content: Any) -> Scene:
     return read_rig(write(folder, content))
-
-
-def test_cameras_project_as_opencv_does(tmp_path: Path) -> None:
-    scene = read(tmp_path, rig_content())
-    px, depth = scene.cameras.project(torch.from_numpy(BALLS))
-    for view in range(4):
-        R, t = arc_pose(view, 4)
-        K = scene.cameras.K[view].numpy() - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
-        expected, _ = cv2.projectPoints(BALLS, cv2.Rodrigues(R)[0], t, K, None)
-        np.testing.assert_allclose(px[view] - 0.5, expected[:, 0], atol=1e-9)
-        assert (depth[view] > 30).all()
 
 
 def test_distorted_photo_positions_agree_with_opencv(tmp_path: Path) -> None:
@@ -99,10 +88,7 @@ def test_unknown_keys_are_warned_of(tmp_path: Path) -> None:
     assert scene.views[3].lens is None
     assert all(one.category is InputWarning for one in caught)
     found = [str(one.message).split(": ", 1)[1] for one in caught]
-    assert found == [
-        "unknown key 'author' of the rig is ignored",
-        "unknown key 'distorsion' of view 3 is ignored",
-    ]
+    assert found == ["unknown key 'author' of the rig is ignored", "unknown key 'distorsion' of view 3 is ignored"]
 
 
 BAD_RIGS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
@@ -110,16 +96,12 @@ BAD_RIGS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"format": None}, {}, "format: Input should be"),
     ({"views": []}, {}, "there are no views"),
     ({"views": None}, {}, "views: Input should be a valid list"),
-    ({"views": [rig_content()["views"][0]]}, {}, "there is a single view"),
     ({}, {"R": np.diag([1.0, -1.0, 1.0]).tolist()}, r"view 1 \(images/001.png\): R is a reflection"),
     ({}, {"R": np.diag([1.0, 1.1, 1.0]).tolist()}, r"view 1 \(images/001.png\): R is not a rotation"),
-    ({}, {"R": np.zeros((3, 3)).tolist()}, "view 1 .*: R is not a rotation"),
     ({}, {"t": [0, float("nan"), 0]}, r"views\[1\]\.t\[1\]: Input should be a finite number"),
-    ({}, {"t": [0, float("inf"), 0]}, r"views\[1\]\.t\[1\]: Input should be a finite number"),
     ({}, {"t": [0, 0]}, r"views\[1\]\.t\[2\]: Field required"),
     ({}, {"t": [0, 0, "up"]}, r"views\[1\]\.t\[2\]: Input should be a valid number"),
     ({}, {"K": [[0, 0, 64], [0, 150, 48], [0, 0, 1]]}, "view 1 .*: the focal length is 0, 150"),
-    ({}, {"K": [[150, 0, 64], [0, -150, 48], [0, 0, 1]]}, "view 1 .*: the focal length is 150, -150"),
     ({}, {"K": [[150, 0, 0], [0, 150, 0], [64, 48, 1]]}, "view 1 .*: K is not upper triangular"),
     ({}, {"width": 0}, r"views\[1\]\.width: Input should be greater than or equal to 1"),
     ({}, {"width": 10**30}, r"views\[1\]\.width: Input should be less than or equal to"),
@@ -127,7 +109,6 @@ BAD_RIGS: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"file": "images/000.jpg"}, "views 0 and 1 have the same name '000'"),
     ({}, {"file": "../001.png"}, r"view 1 \(\.\./001.png\): the file name leads out of the scene folder"),
     ({}, {"distortion": [0.1, 0.2]}, r"view 1 \(images/001.png\): distortion has 2 numbers, expected k1, k2, p1, p2"),
-    ({}, {"distortion": [0, 0, 0]}, "view 1 .*: distortion has 3 numbers"),
     ({}, {"distortion": [0.1, 0, 0, float("nan")]}, r"views\[1\]\.distortion\[3\]: Input should be a finite number"),
     ({}, {"distortion": [0.1, 0, 0, 0], "K": [[150, 2, 64], [0, 150, 48], [0, 0, 1]]}, "view 1 .*: K has skew"),
 ]
@@ -149,17 +130,12 @@ def test_missing_keys_are_named(key: str, tmp_path: Path) -> None:
         read(tmp_path, rig)
 
 
-@pytest.mark.parametrize(
-    "content", ["", "{", "nonsense", '{"format": "mvseg-rig/1", "views": [{"fi', "[" * 99999, "9" * 9999]
-)
-def test_broken_json(content: str, tmp_path: Path) -> None:
-    (tmp_path / "cameras.json").write_text(content)
-    with pytest.raises(InputError, match=r"cameras.json: not a whole JSON file"):
-        read_rig(tmp_path / "cameras.json")
+CUT = [b"", b"{", b"nonsense", b'{"format": "mvseg-rig/1", "views": [{"fi', b"[" * 99999, b"9" * 9999, b"\xff\xfe\x80"]
 
 
-def test_bytes_that_are_no_text(tmp_path: Path) -> None:
-    (tmp_path / "cameras.json").write_bytes(b"\xff\xfe\x80")
+@pytest.mark.parametrize("content", CUT, ids=lambda content: str(content[:20]))
+def test_broken_json(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "cameras.json").write_bytes(content)
     with pytest.raises(InputError, match=r"cameras.json: not a whole JSON file"):
         read_rig(tmp_path / "cameras.json")
 
@@ -174,10 +150,6 @@ def test_other_json(content: str, tmp_path: Path) -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cameras.json: cannot be read"):
         read_rig(tmp_path / "cameras.json")
-
-
-def test_image_size_is_that_of_the_camera(tmp_path: Path) -> None:
-    assert read(tmp_path, rig_content()).cameras.sizes.tolist() == [[WIDTH, HEIGHT]] * 4
 
 
 def test_sizes_come_from_the_photos(tmp_path: Path) -> None:

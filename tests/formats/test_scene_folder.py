@@ -146,15 +146,6 @@ def test_views_in_subfolders_have_masks_in_subfolders(tmp_path: Path) -> None:
     assert load_masks(scene, folder / "nested").num_per_view.tolist() == [3, 3, 3, 3]
 
 
-def test_all_masks_empty(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "plant")
-    for path in (folder / "masks").iterdir():
-        write_image(path, np.zeros((HEIGHT, WIDTH), np.uint16))
-    assert load_masks(load_scene(folder), folder / "masks").num_per_view.tolist() == [0, 0, 0, 0]
-    write_coco_masks(folder, folder / "masks.json")
-    assert load_masks(load_scene(folder), folder / "masks.json").num_per_view.tolist() == [0, 0, 0, 0]
-
-
 def test_missing_masks_are_named(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     scene = load_scene(folder)

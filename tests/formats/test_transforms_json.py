@@ -115,15 +115,16 @@ def test_distortion_agrees_with_opencv(tmp_path: Path) -> None:
         np.testing.assert_allclose(found - 0.5, expected[:, 0], atol=1e-9)
 
 
-@pytest.mark.parametrize("k1", [0.0, 0.05])
-def test_fisheye_agrees_with_opencv(k1: float, tmp_path: Path) -> None:
-    scene = read(tmp_path, transforms() | {"camera_model": "OPENCV_FISHEYE", "k1": k1, "k2": -0.01, "k4": 0.001})
+@pytest.mark.parametrize(("k1", "k3"), [(0.0, 0.002), (0.05, 0.0)])
+def test_fisheye_agrees_with_opencv(k1: float, k3: float, tmp_path: Path) -> None:
+    lens = {"k1": k1, "k2": -0.01, "k4": 0.001} | ({"k3": k3} if k3 else {})
+    scene = read(tmp_path, transforms() | {"camera_model": "OPENCV_FISHEYE"} | lens)
     px, _ = scene.cameras.project(torch.from_numpy(POINTS))
     K = np.array([[150, 0, 101.0], [0, 160, 61.0], [0, 0, 1]])
     for view in range(3):
         R, t = scene.cameras.R[view].numpy(), scene.cameras.t[view].numpy()
         expected, _ = cv2.fisheye.projectPoints(
-            POINTS[:, None], cv2.Rodrigues(R)[0], t, K, np.array([k1, -0.01, 0, 0.001])
+            POINTS[:, None], cv2.Rodrigues(R)[0], t, K, np.array([k1, -0.01, k3, 0.001])
         )
         found = photo_from_pinhole(scene.views[view].lens, scene.cameras.K[view].numpy(), px[view].numpy())
         np.testing.assert_allclose(found, expected[:, 0], atol=1e-9)
@@ -144,11 +145,9 @@ def test_missing_suffix_is_looked_for(tmp_path: Path) -> None:
 
 BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"frames": []}, {}, "there are no views"),
-    ({"frames": transforms()["frames"][:1]}, {}, "there is a single view"),
     ({"fl_x": None}, {}, r"frame 0 \(images/a.png\): 'fl_x' is missing"),
     ({"w": None}, {}, r"frame 0 \(images/a.png\): width and height are missing, and so is the photo"),
     ({"w": 10**30}, {}, "w: Input should be less than or equal to"),
-    ({"fl_x": 0.0}, {}, "view 0 .*: the focal length is 0, 160"),
     ({"camera_model": "CUBIST"}, {}, r"frame 0 .*: the camera model 'CUBIST' is not known, expected OPENCV"),
     ({}, {"camera_model": "EQUIRECTANGULAR"}, r"frame 1 \(images/b.png\): the camera model 'EQUIRECTANGULAR' is not"),
     ({"k4": 0.1}, {}, "frame 0 .*: k4 is 0.1"),
@@ -157,9 +156,7 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"transform_matrix": [[1, 0, 0, 0]] * 2}, r"frames\[1\]\.transform_matrix"),
     ({}, {"transform_matrix": [[1, 0, 0, float("nan")], *np.eye(4)[1:].tolist()]}, r"frames\[1\]\.transform_matrix"),
     ({}, {"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "view 1 .*: R is a reflection"),
-    ({}, {"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "view 1 .*: R is not a rotation"),
     ({}, {"transform_matrix": np.diag([1, 1, 1, 2]).tolist()}, "frame 1 .*: the last row of transform_matrix is not"),
-    ({}, {"transform_matrix": np.diag([1, 1, 1, 0]).tolist()}, "frame 1 .*: the last row of transform_matrix is not"),
 ]
 
 
@@ -171,16 +168,6 @@ def test_bad_files_are_named(top: dict[str, Any], frame: dict[str, Any], message
         read(tmp_path, content | top)
 
 
-@pytest.mark.parametrize("length", [0, 1, 60, 700])
-def test_cut_short(length: int, tmp_path: Path) -> None:
-    (tmp_path / "transforms.json").write_text(json.dumps(transforms())[:length])
-    with pytest.raises(InputError, match=r"transforms.json: not a whole JSON file"):
-        read_transforms(tmp_path / "transforms.json")
-
-
-# --- What other programs write into the same file -------------------------------------------------
-
-
 def write_photos(folder: Path, width: int = 200, height: int = 120) -> None:
     (folder / "images").mkdir()
     for name in "abc":
@@ -188,16 +175,11 @@ def write_photos(folder: Path, width: int = 200, height: int = 120) -> None:
 
 
 def test_instant_ngps_fisheye_is_opencvs(tmp_path: Path) -> None:
-    content = transforms() | {"is_fisheye": True, "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.001, "aabb_scale": 4}
+    content = transforms() | {"k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.001}
+    (expected, *_) = read(tmp_path, content | {"camera_model": "OPENCV_FISHEYE"}).views
     del content["camera_model"]
-    scene = read(tmp_path, content)
-    px, _ = scene.cameras.project(torch.from_numpy(POINTS))
-    K, coefficients = np.array([[150, 0, 101.0], [0, 160, 61.0], [0, 0, 1]]), np.array([0.05, -0.01, 0.002, 0.001])
-    for view in range(3):
-        R, t = scene.cameras.R[view].numpy(), scene.cameras.t[view].numpy()
-        expected, _ = cv2.fisheye.projectPoints(POINTS[:, None], cv2.Rodrigues(R)[0], t, K, coefficients)
-        found = photo_from_pinhole(scene.views[view].lens, scene.cameras.K[view].numpy(), px[view].numpy())
-        np.testing.assert_allclose(found, expected[:, 0], atol=1e-9)
+    (found, *_) = read(tmp_path, content | {"is_fisheye": True, "aabb_scale": 4}).views
+    assert (found.lens.model_name, list(found.lens.params)) == ("OPENCV_FISHEYE", list(expected.lens.params))
     assert read(tmp_path, content | {"is_fisheye": False, "k4": 0.0}).views[0].lens.model_name == "FULL_OPENCV"
 
 

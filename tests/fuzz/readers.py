@@ -45,17 +45,11 @@ NAMES = [f"{view:03d}" for view in range(VIEWS)]
 
 @dataclass(frozen=True)
 class Reader:
-    """One format.
+    """One format: {name: a JSON document or bytes} of files."""
 
-    Attributes:
-        whole: {name: content} of files of which one is broken: a JSON document, or bytes.
-        read: reads the folder that holds them.
-        others: {name: content} of files that stay whole.
-    """
-
-    whole: dict[str, Any]
-    read: Callable[[Path], object]
-    others: dict[str, Any] = dataclasses.field(default_factory=dict)
+    whole: dict[str, Any]  # of which one is broken
+    read: Callable[[Path], object]  # of the folder that holds them
+    others: dict[str, Any] = dataclasses.field(default_factory=dict)  # that stay whole
 
 
 def write_files(folder: Path, files: dict[str, Any]) -> None:
@@ -64,8 +58,6 @@ def write_files(folder: Path, files: dict[str, Any]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
 
-
-# --- whole files
 
 K = [[20.0, 0, 8], [0, 20.0, 6], [0, 0, 1]]
 RIG = {
@@ -284,9 +276,6 @@ lr: 1.0e-3
 val_photos: a
 val_labels: b
 """
-
-
-# --- how they are read
 
 
 def read_cameras(folder: Path) -> None:

@@ -26,20 +26,17 @@ from fuzz.readers import (
     COCO,
     CONFIG,
     LABELME,
-    METADATA,
     METASHAPE,
     RESULT,
     RESULT_RUN,
     RIG,
     RUN,
-    STATE,
     TRAIN_CONFIG,
     TRANSFORMS,
     TURNTABLE,
     YOLO_NAMES,
     Reader,
     readers,
-    save,
     write_files,
 )
 from mvseg.errors import InputError, InputWarning
@@ -129,7 +126,6 @@ def with_value(document: Any, *path: Any, value: Any) -> bytes:
 
 FIRST = ("annotations", 0)
 PAST_FAILURES: list[tuple[str, str, bytes]] = [
-    *(("coco", "masks.json", with_value(COCO, *FIRST, "id", value=value)) for value in (2**63, -(2**63) - 1)),
     *(
         ("coco for training", "masks.json", with_value(COCO, *FIRST, "segmentation", value=value))
         for value in ([[1e300, 1, 2, 3, 4, 5]], {"size": [1 << 20, 1 << 20], "counts": [1 << 40]}, "x", 3)
@@ -146,9 +142,6 @@ PAST_FAILURES: list[tuple[str, str, bytes]] = [
     ("result", "traits.csv", b"plant,leaf\n"),
     ("rig", "cameras.json", with_value(RIG, "views", 0, "K", value=[[1e300, 0, 1], [0, 1e300, 1], [0, 0, 1]])),
     ("rig", "cameras.json", with_value(RIG, "views", 0, "t", value=[1e300, 0, 1])),
-    ("rig", "cameras.json", b'{"format": "mvseg-rig/1", "views": [' + b"1," * 100_000 + b"1]}"),
-    ("rig", "cameras.json", b"[" * 100_000),
-    ("rig", "cameras.json", b"1" * 5000),
     ("calibration", "camera.yaml", CALIBRATION + b"a: &a [x]\nb: *a\n"),
     ("calibration", "camera.yaml", CALIBRATION + b"a: " + b"[" * 20_000),
     ("yolo", "masks/data.yaml", YOLO_NAMES + b"a: &a [x]\nb: *a\n"),
@@ -161,17 +154,6 @@ PAST_FAILURES: list[tuple[str, str, bytes]] = [
     ("config", "run.yaml", b"match: {seed: " + b"1" * 5000 + b"}"),
     ("config", "run.yaml", b"match: " + b"[" * 20_000),
     ("config", "run.yaml", b"a: &a [x]\nb: &b [*a, *a]\n"),
-    *(
-        ("safetensors", "w.safetensors", save(STATE, METADATA | {key: value}))
-        for key, value in (
-            ("categories", "null"),
-            ("categories", "3"),
-            ("categories", "["),
-            ("image_size", "0"),
-            ("image_size", "x"),
-            ("image_size", "1000000"),
-        )
-    ),
     ("config", "run.yaml", b"match:\n  num_restarts:\n"),
     ("config", "run.yaml", b"coco_crowd:\n"),
     ("config", "run.yaml", b"match:\n"),
@@ -187,8 +169,3 @@ def test_past_failures_are_refused(
     name: str, file: str, content: bytes, all_readers: dict[str, Reader], tmp_path: Path
 ) -> None:
     assert not is_accepted(all_readers[name], tmp_path / "files", {file: content})
-
-
-def test_a_colmap_name_that_is_no_utf_8_is_refused(all_readers: dict[str, Reader], tmp_path: Path) -> None:
-    reader, file = all_readers["colmap text"], "sparse/images.txt"
-    assert not is_accepted(reader, tmp_path / "files", {file: reader.whole[file].replace(b".png", b"\xff.png")})

@@ -175,15 +175,6 @@ def test_odd_views_explain_far_less_than_the_median() -> None:
     assert odd_views(torch.zeros(5)) == []
 
 
-def test_empty_masks_are_data() -> None:
-    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [0.0, 10, 0]]))
-    nothing = regions_from_label_maps([torch.zeros(240, 320).numpy().astype(int)] * 2)
-    with warns_of("no_masks"):
-        matching = match_regions(nothing, cameras)
-    assert matching.num_instances == 0
-    assert matching.instance_ids.shape == (0,)
-
-
 def test_two_cameras_that_share_a_centre_are_warned_of() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
     centers, radii = torch.tensor([[0.0, 1, 0], [0.0, -1, 1]]).double(), torch.tensor([0.5, 0.5]).double()

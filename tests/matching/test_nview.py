@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -34,17 +33,9 @@ from mvseg.matching.partition import Clusters
 from mvseg.matching.result import Matching
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.scene import Cameras, Scene
+from mvseg.scene import Cameras
 from reference import soft_affinity_reference
-from synthetic import (
-    BallScene,
-    arc_positions,
-    ball_scene,
-    cameras_at,
-    moved,
-    permute_views,
-    render_balls,
-)
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at, moved, permute_views, render_balls
 
 
 def solve(regions: Regions, cameras: Cameras) -> Matching:
@@ -70,9 +61,6 @@ def sweep(balls: BallScene) -> PlaneSweep:
 def scores(balls: BallScene, sweep: PlaneSweep) -> ClusterScores:
     weights = region_affinity(balls.regions, balls.cameras).to_dense().double().numpy()
     return ClusterScores(sweep, ViewGraph(weights, sweep.view_index, sweep.num_views))
-
-
-# --- slow twins
 
 
 def hypothesis_score_reference(sweep: PlaneSweep, row: int, members: set[int]) -> float:
@@ -194,17 +182,6 @@ def test_hypotheses_are_what_points_on_the_ray_show(balls: BallScene, sweep: Pla
             assert label in near if label >= 0 else 0 in patch
 
 
-def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) -> None:
-    xy, region = balls.regions.spread_pixels(25)
-    counts = torch.bincount(region)
-    assert torch.equal(counts, balls.regions.areas.clamp(max=25))
-    for index in (0, 5):
-        x1, y1, _, _ = balls.regions.boxes[index].tolist()
-        column, row = (xy[region == index] - torch.tensor([x1, y1])).long().unbind(1)
-        assert balls.regions.crop(index)[row, column].all()
-        assert len(torch.unique(xy[region == index], dim=0)) == counts[index]
-
-
 def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, block_size=10))
     runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
@@ -227,14 +204,6 @@ def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
     found = again.own(clusters), again.coverages(clusters), em_affinities(scores.sweep)[-1]
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, atol=1e-5)
-
-
-def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
-    clusters = some_clusters(scores.sweep, 6)
-    scores.own(clusters)
-    moved_on = Clusters.of(np.where(np.arange(len(clusters.ids)) == 3, len(clusters), clusters.ids))
-    fresh = ClusterScores(scores.sweep, scores.graph)
-    np.testing.assert_array_equal(scores.own(moved_on), fresh.own(moved_on))
 
 
 def test_hypotheses_are_found_by_the_regions_that_they_name(sweep: PlaneSweep) -> None:
@@ -267,9 +236,6 @@ def test_label_maps_that_grow_step_by_step_give_the_sweep_of_each_step(balls: Ba
         np.testing.assert_array_equal(grown.pixel, expected.pixel)
 
 
-# --- the search
-
-
 def test_balls_are_solved_and_scored(balls: BallScene) -> None:
     matching = solve(balls.regions, balls.cameras)
     assert same_partition(matching.instance_ids, balls.regions.labels)
@@ -281,10 +247,6 @@ def test_balls_are_solved_and_scored(balls: BallScene) -> None:
     sure = matching.match_scores >= 0.5
     seen = [len(set(balls.regions.view_index[sure & (matching.instance_ids == k)].tolist())) for k in range(1, 8)]
     assert matching.support.tolist() == seen
-
-
-def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
-    assert same_partition(solve(demo_regions, demo_scene.cameras).instance_ids, demo_truth)
 
 
 def test_same_answer_twice_and_in_any_order_of_views_and_regions() -> None:
@@ -379,7 +341,12 @@ def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene,
     assert scores.value(partition) >= scores.value(truth) - 1e-6
 
 
-def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, sweep: PlaneSweep) -> None:
+@pytest.mark.parametrize("views", [EM.views, 4])
+def test_soft_affinity_is_symmetric_and_favours_the_truth(
+    views: int, balls: BallScene, sweep: PlaneSweep, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where a few of many views tell it."""
+    monkeypatch.setattr("mvseg.matching.nview.initialisation.EM", replace(EM, views=views))
     A = em_affinities(sweep)[-1]
     np.testing.assert_allclose(A, A.T)
     same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
@@ -404,47 +371,31 @@ def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_allclose(em_affinities(sweep)[1], expected, atol=2e-4)
 
 
-def test_a_few_of_many_views_tell_the_soft_affinity(
-    balls: BallScene, sweep: PlaneSweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.initialisation.EM", replace(EM, views=4))
-    A = em_affinities(sweep)[-1]
-    same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
-    across = sweep.view_index[:, None] != sweep.view_index
-    assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
-
-
-# --- cameras of every kind
-
-
-def test_full_ring() -> None:
-    angle = torch.arange(8) / 8 * 2 * torch.pi
-    cameras = cameras_at(torch.stack((10 * angle.cos(), 10 * angle.sin(), 3 + angle.sin()), 1))
-    scene = ball_scene(8, 3, seed=8)
-    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
-    assert same_partition(solve(regions, cameras).instance_ids, regions.labels)
-
-
 def test_instances_that_leave_the_image() -> None:
     scene = ball_scene(8, 6, seed=9, focal=900.0)
     assert int((scene.regions.boxes[:, 0] == 0).sum()) > 3
     assert matching_metrics(solve(scene.regions, scene.cameras).instance_ids, scene.regions.labels).ari > 0.95
 
 
-def test_cameras_on_a_line() -> None:
-    x = torch.linspace(-3, 3, 6)
-    cameras = cameras_at(torch.stack((x, torch.full((6,), -10.0), torch.zeros(6)), 1))
-    scene = ball_scene(6, 3, seed=10, radius=0.3)
-    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
-    assert matching_metrics(solve(regions, cameras).instance_ids, regions.labels).ari > 0.9
+TURN = torch.arange(8) / 8 * 2 * torch.pi
+RING = torch.stack((10 * TURN.cos(), 10 * TURN.sin(), 3 + TURN.sin()), 1)
+LINE = torch.stack((torch.linspace(-3, 3, 6), torch.full((6,), -10.0), torch.zeros(6)), 1)
+FACING = torch.tensor([[0.0, -8, 0.2], [0.3, -14, 0], [0, 9, 0.5], [8, 0.5, 1]])  # epipoles lie inside the images
 
 
-def test_epipoles_inside_the_images() -> None:
-    """Cameras that see each other, one behind the other and across."""
-    cameras = cameras_at(torch.tensor([[0.0, -8, 0.2], [0.3, -14, 0], [0, 9, 0.5], [8, 0.5, 1]]), focal=250.0)
-    scene = ball_scene(6, 3, seed=12)
+@pytest.mark.parametrize(
+    ("cameras", "options", "least"),
+    [
+        (cameras_at(RING), {"num_balls": 8, "seed": 8}, 1),
+        (cameras_at(LINE), {"num_balls": 6, "seed": 10, "radius": 0.3}, 0.9),
+        (cameras_at(FACING, focal=250.0), {"num_balls": 6, "seed": 12}, 0.9),
+    ],
+    ids=["ring", "line", "facing"],
+)
+def test_cameras_of_every_kind(cameras: Cameras, options: dict, least: float) -> None:
+    scene = ball_scene(num_views=3, **options)
     regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
-    assert matching_metrics(solve(regions, cameras).instance_ids, regions.labels).ari > 0.9
+    assert matching_metrics(solve(regions, cameras).instance_ids, regions.labels).ari >= least
 
 
 def test_two_views_fall_back_on_the_pairs() -> None:
@@ -463,16 +414,6 @@ def test_nothing_to_match() -> None:
     labels = render_balls(cameras[[0]], torch.zeros(1, 3), torch.ones(1))[0]
     matching = solve(regions_from_label_maps([labels, np.zeros_like(labels), np.zeros_like(labels)]), cameras)
     assert matching.instance_ids.tolist() == [-1]
-
-
-def test_two_cameras_that_share_a_centre() -> None:
-    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0], [7.0, 7, 3]]))
-    scene = ball_scene(4, 3, seed=3)
-    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        matching = solve(regions, cameras)
-    assert matching_metrics(matching.instance_ids, regions.labels).ari > 0.9
 
 
 def test_wrong_poses_are_noticed() -> None:

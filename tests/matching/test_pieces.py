@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 
 from mvseg.matching.links import Links
@@ -54,9 +53,3 @@ def test_what_a_person_joined_stays(demo_scene: Scene, demo_regions: Regions, de
     first = int((chosen.view_index == chosen.view_index[lone]).nonzero()[neighbour, 0])
     ids = match_regions(chosen, demo_scene.cameras, links=Links.of([(lone, first)])).instance_ids
     assert ids[lone] == ids[first] > 0
-
-
-@pytest.mark.parametrize("num_views", [2, 3])
-def test_few_views_are_no_error(num_views: int) -> None:
-    scene = ball_scene(3, num_views, seed=0)
-    assert len(match_regions(scene.regions, scene.cameras)) == len(scene.regions)

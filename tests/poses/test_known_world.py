@@ -161,19 +161,6 @@ def test_positions_of_nothing(room, tmp_path: Path) -> None:
         place(room.scene, WorldFacts(positions=path))
 
 
-@pytest.mark.parametrize(
-    ("known", "message"),
-    [
-        ({"marker": 3.0, "distance": ("a", "b", 2.0)}, "marker and distance both give a scale"),
-        ({"marker": 0.0}, "marker is 0 long"),
-        ({"distance": ("a", "b", -1.0)}, "distance is -1 long"),
-    ],
-)
-def test_contradictions(known, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        WorldFacts(**known)
-
-
 def test_nothing_known_leaves_the_scene_as_it_is(room) -> None:
     placement = place(room.scene, WorldFacts())
     np.testing.assert_array_equal(placement.similarity.matrix(), np.eye(4)[:3])

@@ -60,14 +60,6 @@ def test_what_another_instance_may_hide_is_not_free() -> None:
     assert not locate_points(hidden, points)[1].any()
 
 
-def test_masks_without_a_common_point_have_no_hull() -> None:
-    masks = [NOTHING > 0, NOTHING > 0]
-    masks = [mask.copy() for mask in masks]
-    masks[0][:20, :20], masks[1][-20:, -20:] = True, True
-    matrices = ring_cameras(2).px_from_world.numpy()
-    assert len(carve_hull(stack_masks(masks, [NOTHING] * 2, range(2), px_from_world=matrices)).voxels) == 0
-
-
 def test_a_thin_mask_beside_large_ones_keeps_pixels() -> None:
     """Pixels are made larger for the others: without any, the mask has no middle."""
     masks = [np.zeros((900, 900), bool) for _ in range(3)]

@@ -24,7 +24,6 @@ import mvseg.results.report.page
 from known_leaves import bent_blade
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.scene_folder import load_masks
@@ -45,7 +44,6 @@ from scene_folders import (
     WIDTH,
     K,
     arc_pose,
-    cut_file,
     draw_labels,
     edit_rig,
     rig_content,
@@ -117,10 +115,6 @@ def label_of_balls(folder: Path, plant: Path) -> list[list[int]]:
 
 
 class TestContent:
-    def test_names_of_all_files(self, saved: Path) -> None:
-        assert files_below(saved) == IDS_FILES | SHAPE_FILES
-        assert list(saved.parent.iterdir()) == [saved]
-
     def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
         report = replace(result.matching.report, residual_px=2)
         is_unsure = result.masks.view_index < result.masks.instance_ids - 1  # instance 2 in one view, 3 in two
@@ -213,19 +207,8 @@ class TestContent:
         names |= {path.name for path in saved.iterdir() if path.is_file()}
         assert [name for name in sorted(names) if f"`{name}`" not in described] == []
 
-    def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
-        regions, truth = read_instances(saved, plant / "truth")
-        ids, true = regions.labels, true_instances(regions, truth)
-        assert len(ids) == len(true) == 12
-        assert len({*zip(ids.tolist(), true.tolist(), strict=True)}) == 3
-        assert set(true.tolist()) == {1, 2, 3}
-
 
 class TestVariants:
-    def test_ids_only(self, result: Result, tmp_path: Path) -> None:
-        save_result(ids_only(result), tmp_path / "out", {})
-        assert files_below(tmp_path / "out") == IDS_FILES
-
     def test_without_a_report(self, result: Result, tmp_path: Path) -> None:
         save_result(ids_only(result), tmp_path / "out", {}, report=False)
         assert files_below(tmp_path / "out") == IDS_FILES - {"report.html"}
@@ -317,24 +300,6 @@ class TestVariants:
         again = load_masks(result.scene, tmp_path / "out" / "instances.json")
         assert torch.equal(again.crops, result.regions.crops)
         assert torch.equal(again.view_index, result.regions.view_index)
-
-
-class TestBrokenPhotos:
-    @pytest.fixture
-    def plant(self, tmp_path: Path) -> Path:
-        return write_scene(tmp_path / "plant")
-
-    def test_one_missing_photo(self, plant: Path, tmp_path: Path) -> None:
-        (plant / "images" / "002.png").unlink()
-        with pytest.raises(InputError, match=r"002\.png: the image of view 2 is missing"):
-            save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
-        assert [path.name for path in tmp_path.iterdir()] == ["plant"]
-
-    def test_cut_photo(self, plant: Path, tmp_path: Path) -> None:
-        cut_file(plant / "images" / "002.png", 0.8)
-        with pytest.raises(InputError, match=r"002\.png: the image of view 2 cannot be read"):
-            save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
-        assert [path.name for path in tmp_path.iterdir()] == ["plant"]
 
 
 WRITERS = [
@@ -568,19 +533,9 @@ class TestReadInstances:
     def broken(self, saved: Path, tmp_path: Path) -> Path:
         return shutil.copytree(saved, tmp_path / "broken")
 
-    def test_no_result(self, tmp_path: Path, plant: Path) -> None:
-        with pytest.raises(InputError, match=r"instances\.json: is missing, expected a result folder"):
-            read_instances(tmp_path, plant / "truth")
-
     def test_no_truth(self, saved: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="absent: no such folder of true labels"):
             read_instances(saved, tmp_path / "absent")
-
-    @pytest.mark.parametrize("share", [0, 0.1, 0.9])
-    def test_cut(self, broken: Path, plant: Path, share: float) -> None:
-        cut_file(broken / "instances.json", share)
-        with pytest.raises(InputError, match=r"instances\.json: not a whole JSON file"):
-            read_instances(broken, plant / "truth")
 
     @pytest.mark.parametrize(
         ("key", "value", "message"),

@@ -11,14 +11,7 @@ import torch
 
 from mvseg.masks import Masks
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.results.overlay import (
-    MARGIN,
-    MAX_SIDE,
-    UNMATCHED,
-    draw_overlay,
-    find_plant,
-    instance_color,
-)
+from mvseg.results.overlay import MARGIN, MAX_SIDE, UNMATCHED, draw_overlay, find_plant, instance_color
 
 GREY = np.full((200, 300, 3), 90, np.uint8)
 

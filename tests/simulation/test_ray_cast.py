@@ -97,14 +97,6 @@ def test_ids_and_depths_agree_with_opencv_projection(family: str, view: int) -> 
     assert np.allclose(shot.depth[seen], depth[seen], rtol=1e-4)
 
 
-def test_half_a_pixel_matters() -> None:
-    """The oracle above would notice zero-centred pixels."""
-    plant = grow_plant("ovate", 5, seed=1)
-    shifted = ring(plant)
-    shifted.K[:, :2, 2] += 0.5
-    assert (rasterize(plant, shifted, 0)[0] == shoot(plant).ids).mean() < 0.99
-
-
 def test_pixel_centres_decide() -> None:
     cameras = look_down(100.0, focal=100.0, size=(8, 6))  # one unit of the plane is one pixel
     square = make_square(7, [[-2.4, 1.4, 0], [-2.4, -1.6, 0], [1.6, -1.6, 0], [1.6, 1.4, 0]])
@@ -144,12 +136,6 @@ def test_ids_and_depths_do_not_depend_on_the_look() -> None:
     assert np.array_equal(one.ids, two.ids)
     assert np.array_equal(one.depth, two.depth)
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 5
-
-
-def test_reruns_are_bit_identical() -> None:
-    one, two = (shoot(grow_plant("strap", 6, seed=4), seed=1) for _ in range(2))
-    for field in ("rgb", "ids", "depth"):
-        assert getattr(one, field).tobytes() == getattr(two, field).tobytes()
 
 
 def test_views_share_the_light_but_not_the_noise() -> None:

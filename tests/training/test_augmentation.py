@@ -13,14 +13,7 @@ import torch
 from torch import Tensor
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.training.augmentation import (
-    MEAN_COLOR,
-    AugmentedSamples,
-    augment,
-    make_target,
-    mix_seed,
-    order_epoch,
-)
+from mvseg.training.augmentation import MEAN_COLOR, AugmentedSamples, augment, make_target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
 from tiny_training import write_photos
@@ -83,10 +76,7 @@ def test_resizing_does_not_shift_masks() -> None:
     layer = ((rows + 0.5 - 120) ** 2 + (columns + 0.5 - 140) ** 2 < 60**2).to(torch.int32)
     photo = torch.zeros((3, 256, 256), dtype=torch.uint8)
     labelled = LabelledPhoto(
-        photo=photo,
-        layers=layer[None],
-        classes=torch.tensor([1]),
-        ignore=torch.zeros_like(layer, dtype=torch.bool),
+        photo=photo, layers=layer[None], classes=torch.tensor([1]), ignore=torch.zeros_like(layer, dtype=torch.bool)
     )
     mask = augment(labelled, PLAIN, 0)[1]["masks"][0]
     centroid = (mask.nonzero().float() + 0.5).mean(0)

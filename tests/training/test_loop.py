@@ -77,9 +77,6 @@ def run_script(log: Path, *arguments: str | Path) -> None:
     assert result.returncode == 0, log.read_text()
 
 
-# --- a run and its files
-
-
 def test_a_run_learns_and_writes_its_files(finished: Path, leaves: Path) -> None:
     metrics, log = read_metrics(finished), read_log(finished)
     assert [record["step"] for record in log] == list(range(1, 13))
@@ -145,9 +142,6 @@ def test_a_shipped_architecture_trains_and_its_export_loads(tmp_path: Path) -> N
     assert all(torch.equal(value, expected[key]) for key, value in loaded.state_dict().items())
 
 
-# --- laws
-
-
 @pytest.mark.slow
 def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: Path) -> None:
     """The same losses in every step, the same weights and AP; one process does two forward passes where two do one."""
@@ -184,9 +178,6 @@ def test_resuming_a_finished_run_changes_nothing(few: Path, tmp_path: Path) -> N
     before = (tmp_path / "checkpoint.pt").read_bytes()
     train(dataclasses.replace(config, resume=True), build_tiny())
     assert (tmp_path / "checkpoint.pt").read_bytes() == before
-
-
-# --- failures
 
 
 def test_a_loss_that_is_not_finite_names_its_photos(leaves: Path, tmp_path: Path) -> None:
@@ -310,12 +301,6 @@ def test_validation_set_of_other_categories(leaves: Path, tmp_path: Path) -> Non
     )
     with pytest.raises(InputError, match="has categories"):
         train(config, build_tiny())
-
-
-# --- files
-
-
-# --- real plants
 
 
 @pytest.mark.slow

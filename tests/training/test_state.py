@@ -20,9 +20,6 @@ from mvseg.training.loop import cut_log
 from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, learning_rate, start_state
 from tiny_training import build_tiny, make_config, parse_config, write_photos
 
-# --- configs
-
-
 ROOT = Path(__file__).parents[2]
 RECIPES = [*(ROOT / "configs" / "train").glob("*.yaml"), *(ROOT / "models").glob("*/recipe/leaf-*.yaml")]
 
@@ -50,9 +47,6 @@ def test_published_configs_are_sound(path: Path) -> None:
 def test_config_problems(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         make_config(Path(), Path(), **changes)
-
-
-# --- steps
 
 
 def step_once(config: TrainConfig, gradient: float, averaged: bool = False) -> tuple[TrainingState, bool]:
@@ -154,9 +148,6 @@ def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: P
     assert all(torch.isfinite(loss) for loss in sound.values())
 
 
-# --- learning rates
-
-
 def test_learning_rate_warms_up_and_falls() -> None:
     config = make_config(Path(), Path(), lr=1.0, batch_size=16, warmup_steps=4)
     rates = [learning_rate(config, step, 100) for step in range(100)]
@@ -173,9 +164,6 @@ def test_learning_rate_warms_up_and_falls() -> None:
 def test_learning_rate_scales_with_the_global_batch(optimizer: Any, factor: float) -> None:
     config = make_config(Path(), Path(), lr=1.0, batch_size=4, warmup_steps=0, optimizer=optimizer)
     assert learning_rate(config, 0, 100) == pytest.approx(factor)
-
-
-# --- files
 
 
 def test_a_log_is_cut_where_the_run_goes_on(tmp_path: Path) -> None:

@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from known_leaves import (
-    bent_blade,
-    fit_coefficients,
-    flat_leaf,
-    folded_sheet,
-    make_surface,
-    move,
-    turn_about,
-)
+from known_leaves import bent_blade, fit_coefficients, flat_leaf, folded_sheet, make_surface, move, turn_about
 from mvseg.formats.text_file import format_number
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid

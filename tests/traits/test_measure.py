@@ -180,16 +180,6 @@ def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
     assert leaf.numbers["area"].method == why
 
 
-def test_unknown_up() -> None:
-    matching, surfaces = make_inputs([1, 2, 3, 4])
-    traits = measure_plant(replace(SCENE, up=None), matching, surfaces=surfaces, voxels={})
-    for number in (traits.leaves[0].numbers["inclination"], traits.whole["height"]):
-        assert not number.exists
-        assert "up is not known" in number.method
-    assert traits.leaves[0].numbers["area"].exists
-    assert traits.whole["convex_hull_volume"].exists
-
-
 def test_the_stem_tells_up_less_surely() -> None:
     names = ("inclination", "area", "insertion_height", "height")
     numbers = {name: Measurement(30.0, 3.0, "surface") for name in names}

@@ -106,12 +106,6 @@ def test_one_flat_leaf_spans_no_volume() -> None:
     assert found["convex_hull_volume"].method == "not measured: the leaves span no volume"
 
 
-def test_leaves_without_a_surface_are_counted_and_said() -> None:
-    found = measure(some_leaves(), num_leaves=5)
-    assert found["number_of_leaves"].value == 5
-    assert found["total_leaf_area"].method == "surface (3 of 5 leaves)"
-
-
 def test_without_up_what_needs_it_is_empty() -> None:
     found = measure_whole(some_leaves(), None, num_leaves=3)
     assert {name for name, number in found.items() if not number.exists} == {"height"}

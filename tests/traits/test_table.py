@@ -168,16 +168,8 @@ def test_traits_of_older_versions_are_passed_over(tmp_path: Path) -> None:
     assert found.leaves[0].numbers.keys() == traits.leaves[0].numbers.keys()
 
 
-def test_columns_and_lines_of_a_leaf() -> None:
-    """As many cells in each column as there are leaves; `print` of a leaf is a line with its size."""
+def test_columns_have_a_cell_for_each_leaf() -> None:
     traits = traits_of()
     columns = traits.table()
     assert {len(cells) for cells in columns.values()} == {len(traits.leaves)}
     assert columns["area"][0] == traits.leaves[0].numbers["area"].value
-    numbers = traits.leaves[0].numbers | {"area": Measurement(315.2, 8.1, ""), "length": Measurement(27.06, 0.61, "")}
-    leaf = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons={}, rejection=None, unit="mm")
-    assert repr(leaf) == "leaf 1: 315.2 +- 8.1 mm^2, 27.06 +- 0.61 mm long"
-    large = replace(leaf, numbers=numbers | {"area": Measurement(1568.4, 21.3, "")})
-    assert repr(large) == "leaf 1: 1,568 +- 21 mm^2, 27.06 +- 0.61 mm long"
-    assert repr(traits) == "Traits('basil': 2 leaves, mm)"
-    assert repr(traits.leaves[1]) == f"leaf 2: {traits.leaves[1].quality}"

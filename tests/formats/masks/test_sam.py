@@ -47,8 +47,3 @@ def test_bad_files_are_named(content: Any, message: str, tmp_path: Path) -> None
     (tmp_path / "a.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match=message):
         read_sam(tmp_path / "a.json", 30, 20)
-
-
-def test_an_entry_without_a_mask(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text(json.dumps([{"bbox": [1, 2, 3, 4]}]))
-    assert read_sam(tmp_path / "a.json", 30, 20)[0].mask is None
