@@ -31,6 +31,7 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
@@ -54,17 +55,28 @@ class Given:
     cameras: Cameras
 
 
+def read_given(folder: Path) -> Given:
+    """The `masks/` of a real plant."""
+    scene = load_scene(folder)
+    regions = load_masks(scene, folder / "masks")
+    sizes = scene.cameras.sizes.tolist()
+    maps = [
+        read_label_png(folder / "truth" / f"{view.name}.png", *size)
+        for view, size in zip(scene.views, sizes, strict=True)
+    ]
+    word = folder.parent.name if folder.parent.name.endswith("-series") else folder.name
+    return Given(folder.name, word.split("-")[0], regions, true_instances(regions, maps), scene.cameras)
+
+
+def choose_given(matched: Masks, cameras: Cameras) -> Masks:
+    """The masks with the ids that hold once surfaces checked them."""
+    judges = Judges(cameras.to("cpu"), holds=True, cache=SurfaceCache())
+    again = find_again(matched, judges, MatchConfig())
+    return choose_leaves(matched, [each for each in (matched, again) if each is not None], judges).masks
+
+
 def list_masks(args: argparse.Namespace) -> Iterator[Given]:
-    for folder in args.real:
-        scene = load_scene(folder)
-        regions = load_masks(scene, folder / "masks")
-        sizes = scene.cameras.sizes.tolist()
-        maps = [
-            read_label_png(folder / "truth" / f"{view.name}.png", *size)
-            for view, size in zip(scene.views, sizes, strict=True)
-        ]
-        word = folder.parent.name if folder.parent.name.endswith("-series") else folder.name
-        yield Given(folder.name, word.split("-")[0], regions, true_instances(regions, maps), scene.cameras)
+    yield from map(read_given, args.real)
     for kind in args.masks:
         if kind != "pieces":
             for spec in chosen_scenes(args):
@@ -98,9 +110,7 @@ def main() -> None:
         times = [time.process_time()]
         matched = match_regions(given.regions, given.cameras).masks
         times.append(time.process_time())
-        judges = Judges(given.cameras, holds=True, cache=SurfaceCache())
-        again = find_again(matched, judges, MatchConfig())
-        checked = choose_leaves(matched, [each for each in (matched, again) if each is not None], judges).masks
+        checked = choose_given(matched, given.cameras)
         times.append(time.process_time())
         is_moved = (matched.instance_ids != checked.instance_ids).numpy()
         both = matched.instance_ids, checked.instance_ids

@@ -1,14 +1,12 @@
-"""What sizes and the views bring: `python benchmarks/learn.py SCENE... [--sizes 800 400] [--rounds 3]`
+"""What the views teach: `python benchmarks/learn.py SCENE... [--rounds 3]`
 
-For each scene a table: as it is; at each of --sizes, nothing learned; after one, two, three rounds (each from the
-labels of the last, whatever the agreed area says), and after one round in which a person has outlined six leaves in
-two photos each, the largest ones that are not right; these outlines do not count in the figures. With --next, what the
-weights of each round find on the next plant, as they are. The agreed area (`rate_pass`, in percent of all pixels)
-stands beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3`
-would keep: it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves
-it says how many are stems (`tube_evidence`), and E is the expected number of correct masks. In the end: of all pairs
-of rows of one scene whose MV-PQ differs by `APART` or more, how many the agreed area orders. Weights and detections
-are kept in --cache.
+For each scene a table: as it is; after one, two, three rounds (each from the labels of the last, whatever the agreed
+area says); and after one round in which a person has outlined six leaves in two photos each, the largest ones that are
+not right; these outlines do not count in the figures. The agreed area (`rate_pass`, in percent of all pixels) stands
+beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep:
+it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
+many are stems (`tube_evidence`), and E is the expected number of correct masks. Weights and detections are kept in
+--cache.
 """
 
 from __future__ import annotations
@@ -17,10 +15,7 @@ import argparse
 import sys
 import time
 import warnings
-from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
-from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -40,7 +35,7 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import true_instances
 from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import find_in_photos, plant_of_pass, run_pass
+from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
@@ -49,7 +44,6 @@ from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.traits.filters import SURELY_STEM
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
-APART = 0.02  # MV-PQ of two runs whose order counts, at least
 TABLE = (
     "plant", "seen at", "rounds", "agreement", "agreed area", "E", "MV-PQ", "right", "false (stems)", "recall",
     "precision", "CPU s",
@@ -81,13 +75,12 @@ def outline_some(plant: Plant, truth: list[Labels]) -> Corrections:
     return Corrections(tuple(look.outline(leaf, view) for leaf in chosen for view in best[leaf][:PHOTOS]))
 
 
-def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, begun: float) -> tuple[float, float]:
-    """Print a row; the agreed area and MV-PQ, NaN without a truth."""
+def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, begun: float) -> None:
+    """Print a row."""
     area = 100 * plant.rating.agreed_area / int(plant.scene.cameras.sizes.prod(1).sum())
     row: dict[str, Any] = {"": name, "agreed area": f"{area:.2f}", "stays": stays}
     row |= judge(shape_leaves(plant).masks.to("cpu"), truth) | {"CPU s": f"{time.process_time() - begun:.0f}"}
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
-    return area, float(row.get("MV-PQ", "nan"))
 
 
 def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
@@ -113,41 +106,18 @@ def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
     print("| " + " | ".join(map(str, cells)) + " |", flush=True)
 
 
-def count_ordered(runs: list[tuple[float, float]]) -> tuple[int, int]:
-    """Pairs of runs of one scene, each its agreed area and MV-PQ, that the area orders as MV-PQ does; and all that
-    differ by `APART` in it."""
-    apart = [(one, other) for one, other in combinations(runs, 2) if abs(one[1] - other[1]) >= APART]
-    return sum((one[0] - other[0]) * (one[1] - other[1]) > 0 for one, other in apart), len(apart)
-
-
-def see_next(folder: Path, weights: bytes | None, name: str, *, cache: CachedDetections) -> None:
-    """A row of another plant, seen with learned weights; None: with the shipped ones."""
-    with NamedTemporaryFile(suffix=".safetensors") as file:
-        file.write(weights or b"")
-        file.flush()
-        detect = DetectConfig() if weights is None else DetectConfig(weights=file.name)
-        begun = time.process_time()
-        opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off", detect=detect))
-        plant = find_in_photos(opened, cache=cache)
-    truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
-    show(name, plant, truth, stays="", begun=begun)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--person", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--image_size", type=int, default=None)
-    parser.add_argument("--sizes", type=int, nargs="*", default=())
-    parser.add_argument("--next", type=Path, help="folder of another plant of the same species")
     parser.add_argument("--table", action="store_true", help="a row for each scene, as it comes")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     np.set_printoptions(precision=3)
     warnings.simplefilter("ignore", InputWarning)
-    ordered = [0, 0]
     if args.table:
         print("| " + " | ".join(TABLE) + " |\n|" + "---|" * len(TABLE))
         for folder in args.scenes:
@@ -161,22 +131,14 @@ def main() -> None:
         truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
         print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {plant.image_size} px\n")
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
-        runs = [show("as it is", plant, truth, stays="", begun=begun)]
-        for size in args.sizes:
-            begun, detect = time.process_time(), replace(config.detect, image_size=size)
-            seen = plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=first.boxes))
-            runs.append(show(f"at {size} px", seen, truth, stays="", begun=begun))
-        if args.next is not None:
-            see_next(args.next, None, "the next plant", cache=cache)
+        show("as it is", plant, truth, stays="", begun=begun)
         stays = True
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
             stays = stays and plant.rate_by(before).agreed_area > GROWTH * before.rating.agreed_area
             name = f"round {number}, at {plant.image_size} px"
-            runs.append(show(name, plant, truth, stays="yes" if stays else "no", begun=begun))
-            if args.next is not None:
-                see_next(args.next, plant.learned.weights, f"the next plant, weights of round {number}", cache=cache)
+            show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
         if args.person and truth is not None:
             begun, corrections = time.process_time(), outline_some(first, truth)
             plant = learn(first, cache=cache, corrections=corrections, rounds=1)
@@ -184,8 +146,6 @@ def main() -> None:
             begun = time.process_time()
             corrected = apply_edits(plant, corrections)
             show("the same, and these outlines", corrected, truth, stays="", begun=begun)
-        ordered = [sum(pair) for pair in zip(ordered, count_ordered(runs), strict=True)]
-    print(f"\nThe agreed area orders {ordered[0]} of {ordered[1]} pairs.")
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ import mvseg.matching.numbers
 import mvseg.reconstruction.numbers
 import mvseg.tracking.numbers
 import mvseg.verification.numbers
+from benchmarks.checked_ids import choose_given
 from benchmarks.choice import true_maps
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
@@ -56,7 +57,6 @@ from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
@@ -64,7 +64,6 @@ from mvseg.matching.view_graph import ViewGraph
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -73,7 +72,7 @@ from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
-from mvseg.verification.choose import Judges, choose_leaves, find_again
+from mvseg.verification.choose import Judges, choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
 from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, ROUGH, SNAP
 from mvseg.verification.snap_edges import snap_masks
@@ -245,13 +244,7 @@ TRIALS = {"given": check_given, "simulated": check_simulated, "found": choose_fo
 def check_trial(name: str, regions: Regions, cameras: Cameras, truth: Iterable[np.ndarray]) -> Trial:
     """Surfaces check the ids of given masks."""
     masks = match_masks(Masks.of(regions), cameras).masks
-    judges = Judges(cameras, holds=True, cache=SurfaceCache())
-    return Trial(f"check {name}", CHECKING, partial(check_anew, masks, judges), list(truth))
-
-
-def check_anew(masks: Masks, judges: Judges) -> Masks:
-    again = find_again(masks, judges, MatchConfig())
-    return choose_leaves(masks, [masks] if again is None else [masks, again], judges).masks
+    return Trial(f"check {name}", CHECKING, partial(choose_given, masks, cameras), list(truth))
 
 
 def choose_anew(plant: Plant) -> Masks:

@@ -2,7 +2,6 @@
 
     python -m benchmarks.tracking simulated --num_plants 12            leaves as seen: meshes with noise, no photos
     python -m benchmarks.tracking results TABLE RESULTS [...]          results of mvseg batch, or of `prepare`
-    python -m benchmarks.tracking results TABLE RESULTS --turned 10    the same, each pot turned at random, ten times
     python -m benchmarks.tracking prepare TABLE RESULTS                surfaces from true masks with true ids
     python -m benchmarks.tracking prepare TABLE RESULTS --masks degraded    from degraded masks, matched by mvseg
 
@@ -338,25 +337,6 @@ def turn_date(date: PlantOnDate, degrees: float) -> PlantOnDate:
     return replace(date, leaves=leaves)
 
 
-def compare_turned(series: dict[str, tuple[list[PlantOnDate], Labels]], num_draws: int) -> None:
-    """Print a row per plant, and their mean: of all draws, with the standard error over these."""
-    print("| pots turned at random | short | long |\n|---|---|---|")
-    found = np.zeros((len(series), num_draws, 2))
-    for index, (plant, (dates, truth)) in enumerate(series.items()):
-        for draw in range(num_draws):
-            rng = np.random.default_rng([draw, *plant.encode()])
-            angles = rng.uniform(0, 360, len(dates))
-            turned = [turn_date(date, angle) for date, angle in zip(dates, angles, strict=True)]
-            figures = measure(truth, labels_of(track_leaves(turned), turned))
-            found[index, draw] = figures["short"], figures["long"]
-        short, long = found[index].mean(0)
-        print(f"| ... {plant} | {short:.3f} | {long:.3f} |", flush=True)
-    means = found.mean(0)
-    errors = means.std(0, ddof=1) / np.sqrt(num_draws) if num_draws > 1 else np.full(2, np.nan)
-    shown = " | ".join(f"{mean:.3f} +- {error:.3f}" for mean, error in zip(means.mean(0), errors, strict=True))
-    print(f"| {num_draws} draws | {shown} |")
-
-
 # --- tables
 
 
@@ -419,7 +399,6 @@ def main() -> None:
     parser.add_argument("--num_plants", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--masks", choices=("true", "degraded"), default="true", help="of prepare")
-    parser.add_argument("--turned", type=int, default=0, help="of results: draws of turns of all pots")
     parser.add_argument("--methods", nargs="*", default=["nearest base", "shape", "rank", "cpd"])
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -427,10 +406,7 @@ def main() -> None:
         prepare(*args.places, masks=args.masks)
     elif args.what == "results":
         for series in read_places(args.places).values():
-            if args.turned:
-                compare_turned(series, args.turned)
-            else:
-                compare(series, args.methods)
+            compare(series, args.methods)
     else:
         specs = draw_specs(args.num_plants, seed=args.seed)
         compare({spec.name: see_series(spec) for spec in specs}, args.methods)

@@ -79,10 +79,6 @@ class ClusterScores:
         """
         return self._region_scores(view, self._members_elsewhere(view, numbers))
 
-    def pixel_scores(self, view: int, numbers: Ints) -> Floats:
-        """(K, P) float32: the scores of the view's P sampled pixels, see `scores`."""
-        return self._score_pixels(view, self._members_elsewhere(view, numbers))
-
     def coverages(self, clusters: Clusters) -> Floats:
         """(K, D) float32: share of the pixels of cluster c in other views than n's whose best hypothesis shows n.
 
@@ -127,7 +123,7 @@ class ClusterScores:
     def gains(self, view: int, numbers: Ints, coverages: Floats) -> ViewGains:
         """Gains of the regions of one view from joining the clusters of the other views. `numbers` (D,) are clusters in
         [0, K), -1 for regions to leave out; `coverages` may be older: newer clusters cover nothing."""
-        here, members = self.sweep.bounds.regions(view), self._members_elsewhere(view, numbers)
+        here, members = self.sweep.regions_of[view], self._members_elsewhere(view, numbers)
         sizes = np.array([len(each) for each in members], np.int64)
         clusters = np.flatnonzero(sizes)
         score = self._region_scores(view, [members[number] for number in clusters])
@@ -149,12 +145,12 @@ class ClusterScores:
         return members_of(elsewhere, int(numbers.max(initial=-1)) + 1)
 
     def _region_scores(self, view: int, members: list[Ints]) -> Floats:
-        keys, here = [(view, each.tobytes()) for each in members], self.sweep.bounds.regions(view)
+        keys, here = [(view, each.tobytes()) for each in members], self.sweep.regions_of[view]
         found = _look_up(self._scores, keys, lambda new: self._score_clusters(view, [members[k] for k in new]))
         return np.stack(found, 1) if found else np.zeros((here.stop - here.start, 0), np.float32)
 
     def _score_clusters(self, view: int, members: list[Ints]) -> Floats:
-        regions, pixels = self.sweep.bounds.regions(view), self.sweep.bounds.pixels(view)
+        regions, pixels = self.sweep.regions_of[view], self.sweep.pixels_of[view]
         owner = self.sweep.pixel_region[pixels] - regions.start
         start = run_starts(owner)
         score = np.full((len(members), regions.stop - regions.start), -COSTS.hidden, np.float32)
@@ -165,7 +161,7 @@ class ClusterScores:
 
     def _score_pixels(self, view: int, members: list[Ints]) -> Floats:
         """(C, P) float32: the scores of the view's pixels in C clusters without members in this view."""
-        pixels, here = self.sweep.bounds.pixels(view), self.sweep.bounds.hypotheses(view)
+        pixels, here = self.sweep.pixels_of[view], self.sweep.hypotheses_of[view]
         least = np.float32(-COSTS.hidden)
         best = np.full((len(members), pixels.stop - pixels.start), least)
         cluster, hypothesis, count = self.sweep.hypotheses_of_regions(view).count(members)

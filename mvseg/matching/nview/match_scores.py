@@ -61,7 +61,7 @@ def collect_evidence(scores: ClusterScores, clusters: Clusters, pairwise: Cluste
     sweep, coverages = scores.sweep, scores.coverages(clusters)
     score, own_gain, rival_gain, coverage = (np.zeros(len(clusters.ids)) for _ in range(4))
     for view in np.unique(sweep.view_index).tolist():
-        here = sweep.bounds.regions(view)
+        here = sweep.regions_of[view]
         gains = scores.gains(view, clusters.ids, coverages)
         is_own = clusters.ids[here][:, None] == gains.clusters
         score[here] = (gains.score * is_own).sum(1)

@@ -34,27 +34,6 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class ViewBounds:
-    """Places where each view starts in a `PlaneSweep`: (V + 1,) offsets of its regions, pixels and hypotheses."""
-
-    region_starts: Ints
-    pixel_starts: Ints
-    hypothesis_starts: Ints
-
-    def regions(self, view: int) -> slice:
-        """The regions of one view."""
-        return slice(int(self.region_starts[view]), int(self.region_starts[view + 1]))
-
-    def pixels(self, view: int) -> slice:
-        """The sampled pixels of one view."""
-        return slice(int(self.pixel_starts[view]), int(self.pixel_starts[view + 1]))
-
-    def hypotheses(self, view: int) -> slice:
-        """The hypotheses on rays of one view."""
-        return slice(int(self.hypothesis_starts[view]), int(self.hypothesis_starts[view + 1]))
-
-
-@dataclass(frozen=True, eq=False)
 class PlaneSweep:
     """Hypotheses of the sampled pixels of D regions.
 
@@ -77,15 +56,23 @@ class PlaneSweep:
     _hypotheses_of_regions: dict[int, HypothesesOfRegions] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
-    def bounds(self) -> ViewBounds:
-        """Places where each view starts in the sweep."""
-        numbers = np.arange(self.num_views + 1)
-        pixel_starts = np.searchsorted(self.view_index[self.pixel_region], numbers)
-        return ViewBounds(
-            region_starts=np.searchsorted(self.view_index, numbers),
-            pixel_starts=pixel_starts,
-            hypothesis_starts=np.searchsorted(self.pixel, pixel_starts),
-        )
+    def regions_of(self) -> list[slice]:
+        """The regions of each view."""
+        return self._cut(self.view_index)
+
+    @cached_property
+    def pixels_of(self) -> list[slice]:
+        """The sampled pixels of each view."""
+        return self._cut(self.view_index[self.pixel_region])
+
+    @cached_property
+    def hypotheses_of(self) -> list[slice]:
+        """The hypotheses on rays of each view."""
+        return self._cut(self.view_index[self.pixel_region[self.pixel]])
+
+    def _cut(self, views: Ints) -> list[slice]:
+        ends = np.searchsorted(views, np.arange(self.num_views + 1)).tolist()
+        return [slice(start, end) for start, end in pairwise(ends)]
 
     @cached_property
     def num_inside(self) -> Floats:
@@ -100,7 +87,7 @@ class PlaneSweep:
     def hypotheses_of_regions(self, view: int) -> HypothesesOfRegions:
         """Hypotheses on rays of one view by the regions that they name; cached for the next call."""
         if view not in self._hypotheses_of_regions:
-            labels = self.labels[self.bounds.hypotheses(view)]
+            labels = self.labels[self.hypotheses_of[view]]
             self._hypotheses_of_regions[view] = index_hypotheses(labels, len(self.view_index))
         return self._hypotheses_of_regions[view]
 

@@ -81,7 +81,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
         return clusters
     coverages, joined, is_linked = scores.coverages(clusters), clusters.ids.copy(), scores.graph.is_linked
     for view in np.unique(sweep.view_index[is_few[clusters.ids]]).tolist():
-        here = sweep.bounds.regions(view)
+        here = sweep.regions_of[view]
         gains = scores.gains(view, clusters.ids, coverages)
         fits = ~is_few[gains.clusters] & (gains.coverage >= PIECES.few_covered) & (gains.score > 0)
         moves = is_few[clusters.ids[here]] & fits.any(1) & ~is_linked[here]
@@ -100,7 +100,7 @@ def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) 
     for view in np.unique(graph.view_index[movers.rows]).tolist():
         gains = scores.gains(view, rest, coverages)
         here, place = graph.view_index[movers.rows] == view, np.searchsorted(numbers, gains.clusters)
-        own = movers.rows[here] - scores.sweep.bounds.regions(view).start
+        own = movers.rows[here] - scores.sweep.regions_of[view].start
         for to, values in ((score, gains.score), (coverage, gains.coverage), (total, gains.total)):
             to[np.ix_(here, place)] = values[own]
     sums = movers.total(total)

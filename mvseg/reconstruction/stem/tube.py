@@ -71,11 +71,6 @@ class Tube:
         """(P, 3) of the axis at places u (P,), by default `NUM_ROWS` from end to end."""
         return spline_basis(tube_places(NUM_ROWS) if u is None else u, AXIS) @ self.axis
 
-    def directions(self, u: Floats) -> Floats:
-        """(P, 3) unit vectors along the axis at places u (P,)."""
-        ahead = axis_slopes(u) @ self.axis
-        return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-300)
-
     def radius(self, u: Floats | None = None) -> Floats:
         """(P,) at places u (P,), by default `NUM_ROWS` from end to end."""
         return np.maximum(spline_basis(tube_places(NUM_ROWS) if u is None else u, RADIUS) @ self.radii, 0)
