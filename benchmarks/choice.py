@@ -44,7 +44,7 @@ from mvseg.verification.candidates import Candidates, gather_candidates
 from mvseg.verification.choice import choose
 from mvseg.verification.choose import Judges
 from mvseg.verification.evidence import Drawn, draw_views, see
-from mvseg.verification.leaf_scores import FITTED, LeafScores, matched_features, shows_features
+from mvseg.verification.leaf_scores import FITTED, TERMS, LeafScores, Pairs
 from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
@@ -171,8 +171,9 @@ def mask_samples(each: Study, fitted: LeafScores) -> list[tuple[np.ndarray, np.n
     is_right = (each.leaf[:, None] == each.of_candidate) & (each.of_candidate > 0)
     near = is_known & (evidence.claimed > 0.02) & (each.of_candidate > 0) & each.candidates.has_surface
     own = is_known & ~np.isnan(each.candidates.matched)
-    features = shows_features(evidence, scores), matched_features(each.candidates.matched, scores)
-    return [(features[0][near], is_right[near]), (features[1][own], is_right[own])]
+    pairs = Pairs(each.candidates, evidence, scores)
+    shows, matched = (np.stack([TERMS[name](pairs) for name in kind], 2) for kind in (FITTED.shows, FITTED.matched))
+    return [(shows[near], is_right[near]), (matched[own], is_right[own])]
 
 
 def leaf_samples(each: Study, candidates: Candidates, fitted: LeafScores) -> list[tuple[bool, np.ndarray, bool, float]]:

@@ -14,6 +14,7 @@ from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, see
 from mvseg.verification.leaf_scores import (
     FITTED,
     LeafScores,
+    Pairs,
     best_masks,
     leaf_chances,
     leaf_features,
@@ -125,7 +126,7 @@ def choose(
     hides, steps, is_leaf, q = np.zeros(len(candidates), bool), list[Step](), rows.is_leaf, rows.shows
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
+        q = np.round(show_chances(Pairs(candidates, evidence, scores), fitted), CHOICE.digits)
         q[is_other_class] = 0
         q = rows.add_to(q, is_made)
         steps = rank(

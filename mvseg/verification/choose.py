@@ -30,7 +30,7 @@ from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Fit, Key, gather_candidates
 from mvseg.verification.choice import Choice, Rows, choose
 from mvseg.verification.evidence import Bools, Drawn, Ints, draw_views, see
-from mvseg.verification.leaf_scores import show_chances
+from mvseg.verification.leaf_scores import Pairs, show_chances
 from mvseg.verification.match_again import match_again
 from mvseg.verification.numbers import AGAIN, CHOICE, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
@@ -149,8 +149,8 @@ def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | N
         return None
     candidates = _gather([matched], [matched.proposal], matched, judges.fit, judges)
     drawn, own = draw_views(matched.regions, candidates.surfaces, judges.cameras), candidates.of_rows(0)
-    scores = np.full(len(matched), CHOICE.given)
-    q = show_chances(candidates, see(drawn, len(matched), candidates.is_credible), scores)
+    evidence, scores = see(drawn, len(matched), candidates.is_credible), np.full(len(matched), CHOICE.given)
+    q = show_chances(Pairs(candidates, evidence, scores))
     own_q = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), own]
     return match_again(matched, own, q=own_q, cameras=judges.cameras, config=config)
 

@@ -6,7 +6,7 @@ maximum likelihood. Not in the paper.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +22,11 @@ from mvseg.verification.numbers import CHOICE
 
 @dataclass(frozen=True)
 class LeafScores:
-    """Log odds are the sum of the features times their weights, which are in the order of the features.
+    """Log odds are sums of terms, or of features in their order, times their weights.
 
     Attributes:
-        shows: weights for a mask to show a candidate with a surface: see `shows_features`.
-        matched: the same for a candidate without one: see `matched_features`.
+        shows: weights of `TERMS` for a mask to show a candidate with a surface.
+        matched: the same for a candidate without one.
         leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
         leaf_matched: the same for a candidate without one, by the first four of these features.
     """
@@ -59,29 +59,62 @@ class ClearLeaves:
     length: float
 
 
-def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
-    masks that were matched to a candidate can."""
-    q = expit(matched_features(candidates.matched, scores) @ list(fitted.matched.values()))
-    q = np.where(np.isnan(candidates.matched), 0.0, q)
-    with_surface = candidates.has_surface
-    if with_surface.any():
-        odds = shows_features(evidence, scores) @ list(fitted.shows.values())
-        by_surface = expit(odds) * (evidence.claimed > 0)
-        q = np.where(with_surface, by_surface, q)
-    return q
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """D masks and K candidates, and all that terms of q follow from.
+
+    Attributes:
+        scores: (D,) detection scores.
+    """
+
+    candidates: Candidates
+    evidence: Evidence
+    scores: Floats
 
 
-def shows_features(evidence: Evidence, scores: Floats) -> Floats:
-    """(D, K, 4): 1, and the log odds of the detection score, of `Evidence.claimed` and of `Evidence.visible`."""
-    sure = np.broadcast_to(log_odds(scores)[:, None], evidence.visible.shape)
-    return np.stack((np.ones_like(sure), sure, log_odds(evidence.claimed), log_odds(evidence.visible)), 2)
+def always(pairs: Pairs) -> Floats:
+    """(D, K) 1."""
+    return np.ones_like(pairs.evidence.visible)
 
 
-def matched_features(matched: Floats, scores: Floats) -> Floats:
-    """(D, K, 3): 1, and the log odds of the detection score and of the match score."""
-    sure = np.broadcast_to(log_odds(scores)[:, None], matched.shape)
-    return np.stack((np.ones_like(sure), sure, log_odds(np.nan_to_num(matched))), 2)
+def detector(pairs: Pairs) -> Floats:
+    """(D, K) log odds of the detection score."""
+    return np.broadcast_to(log_odds(pairs.scores)[:, None], pairs.evidence.visible.shape)
+
+
+def claimed(pairs: Pairs) -> Floats:
+    """(D, K) log odds of `Evidence.claimed`."""
+    return log_odds(pairs.evidence.claimed)
+
+
+def visible(pairs: Pairs) -> Floats:
+    """(D, K) log odds of `Evidence.visible`."""
+    return log_odds(pairs.evidence.visible)
+
+
+def matcher(pairs: Pairs) -> Floats:
+    """(D, K) log odds of the match score."""
+    return log_odds(np.nan_to_num(pairs.candidates.matched))
+
+
+TERMS: dict[str, Callable[[Pairs], Floats]] = {
+    "always": always, "detection score": detector, "claimed": claimed, "visible": visible, "match score": matcher
+}  # fmt: skip
+
+
+def sum_terms(weights: Mapping[str, float], pairs: Pairs) -> Floats:
+    """(D, K) log odds: each term that has a weight, times this; their order does not matter."""
+    rows = [weight * TERMS[name](pairs) for name, weight in sorted(weights.items())]
+    return np.asarray(sum(rows), np.float64)
+
+
+def show_chances(pairs: Pairs, fitted: LeafScores = FITTED) -> Floats:
+    """(D, K) q: how likely each mask shows each candidate. Without a surface, only the masks that were matched to a
+    candidate can; with one, those that lie in its image."""
+    candidates = pairs.candidates
+    by_matching = np.where(np.isnan(candidates.matched), -np.inf, sum_terms(fitted.matched, pairs))
+    by_surface = np.where(pairs.evidence.claimed > 0, sum_terms(fitted.shows, pairs), -np.inf)
+    return np.asarray(expit(np.where(candidates.has_surface, by_surface, by_matching)), np.float64)
 
 
 def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:

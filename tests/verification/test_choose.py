@@ -20,8 +20,8 @@ from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
-from mvseg.verification.evidence import draw_views
-from mvseg.verification.leaf_scores import leaf_features
+from mvseg.verification.evidence import Evidence, draw_views
+from mvseg.verification.leaf_scores import TERMS, Pairs, leaf_features, sum_terms
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -361,6 +361,21 @@ def test_clear_leaves_are_what_others_are_held_against() -> None:
     features, clear = leaf_features(candidates, best, sure, share=np.ones((3, 3)), clear=None)
     assert clear.score == pytest.approx(1.4)
     np.testing.assert_allclose(features[:, 3], [-1.2, -0.2, 0.2], atol=1e-12)
+
+
+def test_terms_are_rows_that_add_up() -> None:
+    """In any order; a term that is left out leaves its rows out, and all others as they are."""
+    rng, shape = np.random.default_rng(0), (6, 3)
+    evidence = Evidence(*(rng.random(shape) for _ in range(4)), share=rng.random((2, 3)))
+    matched = np.where(rng.random(shape) < 0.5, rng.random(shape), np.nan)
+    candidates = Candidates((None,) * 3, matched, np.zeros(3), np.zeros(3, np.int64))
+    pairs = Pairs(candidates, evidence, rng.random(6))
+    weights = dict(zip(TERMS, rng.normal(size=len(TERMS)), strict=True))
+    whole = sum_terms(weights, pairs)
+    np.testing.assert_array_equal(whole, sum_terms(dict(reversed(weights.items())), pairs))
+    for name, weight in weights.items():
+        others = {other: value for other, value in weights.items() if other != name}
+        np.testing.assert_allclose(whole - sum_terms(others, pairs), weight * TERMS[name](pairs), atol=1e-9)
 
 
 def test_nothing_is_an_answer() -> None:
