@@ -41,7 +41,7 @@ def write_two_ways(folder: Path) -> Path:
 @contextmanager
 def serve(what: Path | OpenTracks) -> Iterator[CorrectionServer]:
     """The server of a result folder, or of tracks, which computes, too."""
-    corrector = Corrector[OpenResult | OpenTracks](OpenResult(what) if isinstance(what, Path) else what)
+    corrector = Corrector(OpenResult(what) if isinstance(what, Path) else what)
     with CorrectionServer(corrector) as server:
         threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
         for thread in threads:

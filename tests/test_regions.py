@@ -122,14 +122,6 @@ def test_thinned_and_spread_pixels_agree_with_full_frames(most: int) -> None:
     assert [len(each) for each in (*thinned_pixels(nothing, 5), *nothing.spread_pixels(5))] == [0] * 4
 
 
-def test_label_maps_of_any_integer_type_give_the_same_regions() -> None:
-    maps = random_maps(seed=4)
-    expected = regions_from_label_maps(maps)
-    found = regions_from_label_maps([labels.astype(np.int64) for labels in maps])
-    for name in ("view_index", "boxes", "crops", "labels"):
-        assert torch.equal(getattr(found, name), getattr(expected, name))
-
-
 def test_select_keeps_order_and_content() -> None:
     regions = regions_from_label_maps(random_maps())
     index = torch.tensor([4, 0, 5])

@@ -52,7 +52,7 @@ def run(args: Namespace) -> int:
         opened: OpenResult | OpenTracks = OpenTracks(folder, args.plant) if has_tracks else OpenResult(folder)
         if opened.notice:
             say(f"mvseg: {opened.notice}", to_stderr=True)
-        corrector = Corrector[OpenResult | OpenTracks](opened)
+        corrector = Corrector(opened)
         server = stack.enter_context(CorrectionServer(corrector))
         computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:

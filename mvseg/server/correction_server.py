@@ -8,18 +8,22 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from http import HTTPStatus
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from mvseg._version import PACKAGE
 from mvseg.corrections.file import Corrections
 from mvseg.errors import InputError
-from mvseg.server.saved_edits import Refused, SavedEdits
+from mvseg.server.saved_edits import Refused, SavedEdits, Update
 from mvseg.system.running import Cancelled, running
+
+if TYPE_CHECKING:
+    from mvseg.server.open_result import OpenResult
+    from mvseg.server.open_tracks import OpenTracks
 
 WAIT_SECONDS = 20.0  # limit: that a page's question for news stays open
 LOOK_SECONDS = 1.0  # limit: until it looks again whether another program has changed the edits
@@ -38,64 +42,6 @@ def run_command(words: Sequence[str], tell: Callable[[str], None]) -> tuple[int,
                 last_line = line.strip()
                 tell(last_line)
     return process.returncode, last_line
-
-
-class OpenFolder(Protocol):
-    """A folder that the user corrects: a result, or tracks; it holds `CORRECTIONS_FILE`. `learner` is of a result that
-    a detector found; `answers` {place: what else the page asks there} take the body of a request."""
-
-    folder: Path
-
-    @property
-    def answers(self) -> Mapping[str, Callable[[bytes], Mapping[str, Any]]]: ...
-
-    @property
-    def learner(self) -> Learner | None: ...
-
-    def read_edits(self) -> tuple[Corrections, str]:
-        """The edits in the folder, and what the user should know of them. Raises InputError: they cannot be read."""
-
-    def mark(self, corrections: Corrections) -> Corrections:
-        """The edits as they are saved."""
-
-    def page(self, corrections: Corrections) -> str:
-        """The page with the newest result, and with all edits."""
-
-    def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
-        """Compute the consequences of edits, perhaps in several steps. Raises Cancelled: `is_old` said so;
-        InputError."""
-
-    def again(self, place: Path) -> list[str]:
-        """The words after `mvseg` that make all in the folder anew; they may name files written into `place`."""
-
-    def reopened(self) -> Any:
-        """The folder as it is now. Raises InputError."""
-
-
-class Learner(Protocol):
-    """A detector that may learn from `num_views` photos, see `OpenResult.learn`; `is_learned`: it has."""
-
-    @property
-    def is_learned(self) -> bool: ...
-
-    @property
-    def num_views(self) -> int: ...
-
-    def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None: ...
-
-    def unlearn(self) -> None: ...
-
-
-@dataclass(frozen=True)
-class Update:
-    """Consequences of edits: the news for the page, the problem of each edit ("" for none), and warnings."""
-
-    news: dict[str, Any] | None
-    outcomes: list[str]
-    messages: list[str]
-
-
-Kind = TypeVar("Kind", bound=OpenFolder)
 
 
 @dataclass(frozen=True)
@@ -137,7 +83,7 @@ class PageState:
     number: int = 0
 
 
-class Corrector(Generic[Kind]):
+class Corrector:
     """An open folder, its newest edits, and a thread that computes their consequences; the newest edits win.
 
     The same thread lets the detector learn: what is edited meanwhile is saved, and computed afterwards. `news` is the
@@ -145,7 +91,7 @@ class Corrector(Generic[Kind]):
     which another thread makes; None: it is not made.
     """
 
-    def __init__(self, opened: Kind) -> None:
+    def __init__(self, opened: OpenResult | OpenTracks) -> None:
         """Raises InputError: the corrections saved in the folder cannot be read, or are another scene's."""
         self.opened, self.news, self.number = opened, threading.Condition(), 0
         self.edits = SavedEdits(opened.folder, opened.read_edits)
@@ -295,7 +241,7 @@ class Corrector(Generic[Kind]):
         seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * learner.num_views
         return {"now": doing, "isLearned": learner.is_learned, "seconds": seconds}
 
-    def _learner(self) -> Learner:
+    def _learner(self) -> OpenResult:
         if (learner := self.opened.learner) is None:
             raise Refused(HTTPStatus.CONFLICT, "No detector found these masks, so there is none that could learn.")
         return learner

@@ -30,7 +30,7 @@ class CorrectionServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, corrector: Corrector[Any], port: int = 0) -> None:
+    def __init__(self, corrector: Corrector, port: int = 0) -> None:
         self.corrector, self.token = corrector, secrets.token_urlsafe(24)
         super().__init__((HOST, port), _Handler)
         self.address = f"http://{HOST}:{self.server_port}/{self.token}/"

@@ -44,9 +44,8 @@ from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
-from mvseg.server.correction_server import Update
 from mvseg.server.leaf_news import tell_drawn, tell_vanished
-from mvseg.server.saved_edits import CORRECTIONS_FILE
+from mvseg.server.saved_edits import CORRECTIONS_FILE, Update
 from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running

@@ -12,8 +12,7 @@ from mvseg.corrections.file import Corrections, dump_edits, load_corrections, na
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import list_some
-from mvseg.server.correction_server import Update
-from mvseg.server.saved_edits import CORRECTIONS_FILE
+from mvseg.server.saved_edits import CORRECTIONS_FILE, Update
 from mvseg.system.running import Cancelled
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.numbers import PAGE

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from http import HTTPStatus
 from pathlib import Path
+from typing import Any
 
 from mvseg.corrections.file import Corrections, load_corrections, name_edits, parse_corrections, write_corrections
 from mvseg.errors import InputError
@@ -14,6 +16,15 @@ from mvseg.errors import InputError
 CORRECTIONS_FILE = "corrections.json"
 CHANGED = "corrections.json was changed by another program since this page was loaded."
 Read = Callable[[], tuple[Corrections, str]]  # the edits in the folder, and what the user should know of them
+
+
+@dataclass(frozen=True)
+class Update:
+    """Consequences of edits: the news for the page, the problem of each edit ("" for none), and warnings."""
+
+    news: dict[str, Any] | None
+    outcomes: list[str]
+    messages: list[str]
 
 
 class Refused(Exception):

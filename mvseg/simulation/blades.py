@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.surface.leaf_patch import grid_triangles
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
@@ -100,10 +102,7 @@ def blade_stations(rows: int) -> Floats:
 
 def blade_faces(rows: int) -> Ints:
     """(F, 3) faces: a fan at the base vertex, a grid of `rows` x BLADE_COLUMNS vertices, a fan at the tip vertex."""
-    grid = 1 + np.arange(rows * BLADE_COLUMNS).reshape(rows, BLADE_COLUMNS)
-    base, tip = np.zeros(BLADE_COLUMNS - 1), np.full(BLADE_COLUMNS - 1, rows * BLADE_COLUMNS + 1)
-    fans = [np.stack([base, grid[0, :-1], grid[0, 1:]], 1), np.stack([tip, grid[-1, 1:], grid[-1, :-1]], 1)]
-    return np.concatenate([fans[0], grid_faces(grid), fans[1]]).astype(np.int32)
+    return grid_triangles(rows + 2, BLADE_COLUMNS).astype(np.int32)
 
 
 def grid_faces(grid: NDArray[np.int64]) -> NDArray[np.int64]:
