@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -102,18 +101,6 @@ def test_four_cameras_and_twelve_angles(tmp_path: Path) -> None:
     np.testing.assert_allclose(centers[..., 2], centers[:, :1, 2].expand(4, 12), atol=1e-9)  # circles about the axis
     radii = centers[..., :2].norm(dim=-1)
     np.testing.assert_allclose(radii, radii[:, :1].expand(4, 12), atol=1e-9)
-
-
-def test_the_example_of_the_docs(tmp_path: Path) -> None:
-    docs = (Path(__file__).parents[2] / "docs" / "formats.md").read_text(encoding="utf-8")
-    example = next(block for block in re.findall(r"```json\n(.*?)```", docs, re.DOTALL) if "turntable" in block)
-    (tmp_path / "side.yaml").write_text(
-        "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [700, 0, 320, 0, 700, 240, 0, 0, 1]}\n"
-    )
-    scene = read(tmp_path, json.loads(example))
-    px, depth = scene.cameras.project(torch.zeros(1, 3))  # both cameras look at the middle of the table
-    assert px[:, 0].tolist() == [[320, 240], [320, 240], [320.5, 240.5]]
-    assert depth[:, 0].tolist() == [900, 900, 500]
 
 
 BAD: list[tuple[dict[str, Any], str]] = [
