@@ -260,7 +260,7 @@ def _hold(terms: Rows, edited: Edited | None, candidates: Candidates, table: Mas
         before = [-1 if key is None else index.get(key, -1) for key in edited.keys]
         rows = row_of.numpy()
         held[rows] = np.where(held[rows] < 0, before, held[rows])
-    hold = np.where(table.origin == Origin.GIVEN, SURE, 0.0)
+    hold = np.where(table.origin < Origin.OTHER_VIEWS, SURE, 0.0)
     if table.regions.num_views < AGAIN.least_views:  # two masks always agree on some surface
         scores = np.append(candidates.matched, np.full((len(table), 1), np.nan), 1)[np.arange(len(table)), held]
         hold = np.where(scores >= SURE, 1.0, hold)

@@ -350,14 +350,6 @@ class TestWholeOrNotAtAll:
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
         assert {name: (tmp_path / "out" / name).read_bytes() for name in files_below(tmp_path / "out")} == before
 
-    def test_a_full_disk_is_one_sentence(self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        def fail(*_: object) -> None:
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(mvseg.results.folder, "write_coco", fail)
-        with pytest.raises(InputError, match=r"out: the output folder is not writable \(No space left on device\)"):
-            save_result(result, tmp_path / "out", {})
-
     def test_an_earlier_result_survives_a_failing_move(
         self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from blade_scene import SIZE, as_regions
 from known_leaves import flat_leaf
 from matched import matched
-from mvseg.masks import Masks
+from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.verification.choose import Edited
@@ -83,6 +83,15 @@ def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> No
     checked = check(regions, ids, LEAVES | {4: over})
     assert torch.equal(checked.instance_ids, leaves)
     assert torch.equal(checked.close_gaps().instance_ids, leaves)
+
+
+def test_masks_that_a_detector_found_are_held_as_given_ones_are(scene: tuple[Regions, Tensor]) -> None:
+    """Where the views may not choose among its proposals: a small piece of another leaf is no reason to move."""
+    regions, ids = scene
+    away = {number: flat_leaf(length=0.4, half_width=0.1, at=(3.0, 3.0 + number, 0.0)) for number in (1, 2, 3)}
+    detected = replace(matched(regions, ids).masks, origin=torch.full_like(ids, Origin.DETECTED))
+    scored = replace(detected, detection_scores=torch.full((len(ids),), 0.6))
+    assert torch.equal(verify_ids(scored, away, cameras=CAMERAS).instance_ids, ids)
 
 
 def test_an_instance_without_a_surface_keeps_its_masks(scene: tuple[Regions, Tensor]) -> None:
