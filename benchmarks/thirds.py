@@ -49,7 +49,6 @@ from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.config import RunConfig
-from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -65,7 +64,7 @@ from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.regions import Regions, name_regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, plant_index
 from mvseg.simulation.growth import grow_plant

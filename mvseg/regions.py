@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -344,3 +345,11 @@ def stack_regions(
         num_views=num_views,
         labels=torch.tensor(labels, dtype=torch.int64),
     )
+
+
+def name_regions(regions: Regions) -> list[str]:
+    """A name of each of D regions by view and pixels: regions have the same name only if they are equal."""
+    regions = regions.to("cpu")
+    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
+    pixels = (hashlib.sha256(regions.crop(row).numpy().tobytes()).hexdigest() for row in range(len(regions)))
+    return [f"{view} {box} {digest}" for (view, box), digest in zip(places, pixels, strict=True)]

@@ -27,7 +27,6 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import FORMAT, Corrections, Outline, Reject, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
-from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
@@ -38,7 +37,7 @@ from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.plant import Plant, match_given
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.regions import regions_from_label_maps
+from mvseg.regions import name_regions, regions_from_label_maps
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
@@ -433,9 +432,10 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"refine_poses": False, "detect": {"min_views": 2}}, None),  # as everybody had them
+        ({"refine_poses": False, "split_merged": False, "detect": {"min_views": 2}}, None),  # as everybody had them
         ({"refine_poses": True}, "its poses were refined by the masks, and will be those of the scene"),
         ({"detect": {"min_views": 1}}, "made with another min. number of photos"),
+        ({"split_merged": True}, "masks of two leaves were cut in two, and will stay whole"),
     ],
 )
 def test_a_result_made_with_options_that_are_gone(

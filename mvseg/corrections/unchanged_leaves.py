@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
-
 import torch
 from torch import Tensor
 
 from mvseg.corrections.corrected import Corrected
 from mvseg.masks import Masks
-from mvseg.regions import Regions
-
-
-def name_regions(regions: Regions) -> list[str]:
-    """A name of each of D regions by view and pixels: regions have the same name only if they are equal."""
-    regions = regions.to("cpu")
-    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
-    pixels = (hashlib.sha256(regions.crop(row).numpy().tobytes()).hexdigest() for row in range(len(regions)))
-    return [f"{view} {box} {digest}" for (view, box), digest in zip(places, pixels, strict=True)]
 
 
 def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:

@@ -28,6 +28,7 @@ GONE: dict[str, tuple[Any, str]] = {
     "color_card": (None, "color_card_gone"),
     "detect.min_views": (2, "min_views_gone"),
     "refine_poses": (False, "refine_poses_gone"),
+    "split_merged": (False, "split_merged_gone"),
 }
 PLACES = ("scene", "masks", "corrections", "out")  # of run.json's config: what the run read and wrote
 MOST_BYTES = 1 << 34  # limit: of an input that is compared: run.json may name a file without an end

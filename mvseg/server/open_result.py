@@ -20,7 +20,6 @@ from pydantic import BaseModel, Field
 from mvseg.corrections.file import Corrections, Point, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
-from mvseg.corrections.unchanged_leaves import name_regions
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, collect_warnings
@@ -36,7 +35,7 @@ from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant, match_given
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import stack_regions
+from mvseg.regions import name_regions, stack_regions
 from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.read import load_result
 from mvseg.results.report.correct import describe_fate, measure_angles

@@ -49,6 +49,17 @@ class Candidates:
         return tuple(tuple(np.flatnonzero(column).tolist()) for column in ~np.isnan(self.matched.T))
 
     @cached_property
+    def place_of(self) -> dict[Key, int]:
+        """{key: index}."""
+        return {key: index for index, key in enumerate(self.keys)}
+
+    def match_scores(self, rows: Ints, of: Ints) -> Floats:
+        """(N,) match score of N masks, by their rows, for a candidate each; NaN where the matcher gave none, and for
+        candidate -1."""
+        scores: Floats = np.append(self.matched, np.full((len(self.matched), 1), np.nan), 1)[rows, of]
+        return scores
+
+    @cached_property
     def has_surface(self) -> Bools:
         """(K,)"""
         return np.array([each is not None for each in self.surfaces], bool)

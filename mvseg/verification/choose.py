@@ -27,7 +27,7 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
-from mvseg.verification.candidates import Candidates, Fit, Key, gather_candidates
+from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import Choice, Rows, choose
 from mvseg.verification.evidence import Bools, Drawn, Ints, draw_views, see
 from mvseg.verification.leaf_scores import Pairs, show_chances
@@ -147,12 +147,13 @@ def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | N
     """
     if not judges.has_surfaces or not matched.num_instances:
         return None
-    candidates = _gather([matched], [matched.proposal], matched, judges.fit, judges)
-    drawn, own = draw_views(matched.regions, candidates.surfaces, judges.cameras), candidates.of_rows(0)
+    rows, cameras = [matched.proposal], judges.cameras
+    candidates = gather_candidates([matched], rows, table=matched, fit=judges.fit, cameras=cameras)
+    drawn, own = draw_views(matched.regions, candidates.surfaces, cameras), candidates.of_rows(0)
     evidence, scores = see(drawn, len(matched), candidates.is_credible), np.full(len(matched), CHOICE.given)
     q = show_chances(Pairs(candidates, evidence, scores))
     own_q = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), own]
-    return match_again(matched, own, q=own_q, cameras=judges.cameras, config=config)
+    return match_again(matched, own, q=own_q, cameras=cameras, config=config)
 
 
 def choose_leaves(
@@ -188,7 +189,8 @@ def choose_leaves(
     tables, rows = list(matched), [each.proposal for each in matched]
     if edited is not None:  # first, so that what edits say of a leaf is not the same as what was there before
         tables, rows = [edited.concerned(), *tables], [row_of, *rows]
-    candidates = _gather(tables, rows, table, judges.fit if is_judged else None, judges)
+    fit = judges.fit if is_judged else None
+    candidates = gather_candidates(tables, rows, table=table, fit=fit, cameras=judges.cameras)
     views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
     if judges.holds:
@@ -214,12 +216,6 @@ def _add_made(proposals: Masks, edited: Edited | None) -> tuple[Masks, Tensor]:
     return replace(table, origin=origin, is_linked=is_linked), row_of
 
 
-def _gather(
-    tables: Sequence[Masks], rows: Sequence[Tensor], table: Masks, fit: Fit | None, judges: Judges
-) -> Candidates:
-    return gather_candidates(tables, rows, table=table, fit=fit, cameras=judges.cameras)
-
-
 def _is_surrounded(matched: Masks, edited: Edited | None, cameras: Cameras) -> bool:
     masks = matched if matched.num_instances or edited is None else edited.masks
     parallax = median_parallax(masks, cameras)
@@ -232,12 +228,11 @@ def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, d
     """The user as a term."""
     masks, held, stays = edited.masks, edited.is_held.numpy(), edited.stays.numpy()
     shows, rows = np.zeros((len(table), len(candidates))), row_of.numpy()
-    index = {key: number for number, key in enumerate(candidates.keys)}
     changed, is_changed = candidates.of_rows(0), candidates.source == 0
     certain = edited.is_certain.numpy()
     for mask in np.flatnonzero(held).tolist():
         key = edited.keys[mask]
-        candidate = index.get(key, -1) if stays[mask] and key is not None else int(changed[rows[mask]])
+        candidate = candidates.place_of.get(key, -1) if stays[mask] and key is not None else int(changed[rows[mask]])
         shows[rows[mask], is_changed] = -np.inf
         if certain[mask] and candidate >= 0:
             shows[rows[mask], candidate] = np.inf
@@ -256,14 +251,12 @@ def _hold(terms: Rows, edited: Edited | None, candidates: Candidates, table: Mas
     """The ids of given masks as a term: those of the matcher, and after edits those before them."""
     held = candidates.of_rows(0)
     if edited is not None:
-        index = {key: number for number, key in enumerate(candidates.keys)}
-        before = [-1 if key is None else index.get(key, -1) for key in edited.keys]
+        before = [-1 if key is None else candidates.place_of.get(key, -1) for key in edited.keys]
         rows = row_of.numpy()
         held[rows] = np.where(held[rows] < 0, before, held[rows])
     hold = np.where(table.origin < Origin.OTHER_VIEWS, SURE, 0.0)
     if table.regions.num_views < AGAIN.least_views:  # two masks always agree on some surface
-        scores = np.append(candidates.matched, np.full((len(table), 1), np.nan), 1)[np.arange(len(table)), held]
-        hold = np.where(scores >= SURE, 1.0, hold)
+        hold = np.where(candidates.match_scores(np.arange(len(table)), held) >= SURE, 1.0, hold)
     is_gone = np.isneginf(terms.shows).all(1)
     return replace(terms, held=np.where(is_gone, -1, held), hold=hold)
 
@@ -285,7 +278,7 @@ def _make_given(chosen: Choice, candidates: Candidates, masks: Masks, row_of: Te
     number[order] = np.arange(len(order))
     ids = number[chosen.leaf[rows]] + 1
     to = np.append(chosen.candidates, -1)[chosen.leaf[rows]]
-    matched = np.append(candidates.matched, np.full((len(candidates.matched), 1), np.nan), 1)[rows, to]
+    matched = candidates.match_scores(rows, to)
     scores = np.where(np.isnan(matched) | terms.certain[rows].any(1), chosen.q[rows], matched)
     given = replace(
         masks,

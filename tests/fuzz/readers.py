@@ -227,7 +227,7 @@ RESULT_RUN = {
     "poses": {"refined": True, "residual_px": [1.0, None]}, "traits": {"unit": "mm", "up": [0, 0, 1]},
     "edits": [{"op": "reject", "view": "000", "at": [1, 2]}],
     "corrections": [{"edit": 1, "op": "reject", "fate": "applied", "problem": ""}],
-    "counts": {"moved": 1}, "seconds": {"match": 0.5}, "config": {"scene": "/plants", "from_here": {"scene": ".."}},
+    "counts": {"regions": 1}, "seconds": {"match": 0.5}, "config": {"scene": "/plants", "from_here": {"scene": ".."}},
 }  # fmt: skip
 RUN = {"files": {"labels/000.png": "0" * 64, "contact.png": "1" * 64}, "mvseg": "0.1.0"}
 METADATA = {"arch": "resnet18_fpn", "categories": '["leaf"]', "image_size": "320"}

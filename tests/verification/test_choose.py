@@ -74,7 +74,6 @@ def choose(
 
 
 def edit(masks: Masks, *, keys: Sequence[Key] = (), gone: Sequence[int] = ()) -> Edited:
-    """Masks as edits left them; with keys, all leaves stay as they were."""
     stays = torch.full((len(masks),), bool(keys))
     apart = torch.zeros(0, 2, dtype=torch.int64)
     return Edited(masks, tuple(keys) or (None,) * len(masks), stays, torch.tensor(gone, dtype=torch.int64), apart)
