@@ -203,7 +203,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""
-        detections = run_heads(self, image, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view)
+        detections = run_heads(
+            self,
+            image,
+            nms_thresh=self.proposal_iou,
+            detections_per_img=self.proposals_per_view,
+            num_growths=DETECTION.num_growths,
+        )
         frame, is_good = detections.pop("frame"), detections["scores"] >= self.roi_heads.score_thresh
         return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
 

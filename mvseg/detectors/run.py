@@ -16,10 +16,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
-from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.models.detection.roi_heads import maskrcnn_inference, paste_masks_in_image
 from torchvision.models.detection.transform import GeneralizedRCNNTransform, resize_boxes
+from torchvision.ops import batched_nms
 
-from mvseg.detectors.mask_cut import decide_masks
+from mvseg.detectors.mask_cut import CUT, decide_masks
+
+TOUCHED = 0.15  # chosen: min. part of a side of its box that a mask touches, for the box to grow there
+GROWTH = 0.15  # chosen: way that the side then moves, in spans of the box
 
 
 def run_heads(
@@ -28,6 +32,7 @@ def run_heads(
     *,
     nms_thresh: float | None = None,
     detections_per_img: int | None = None,
+    num_growths: int = 0,
 ) -> dict[str, Tensor]:
     """Run the heads of a detector on one photo, before anything is scaled back to the photo. Under autocast the
     backbone may work in half precision; the coordinates of boxes may not, so that everything behind it runs in the
@@ -38,6 +43,7 @@ def run_heads(
         photo: (3, H, W) float32 in [0, 1], on the model's device.
         nms_thresh: IoU above which a box suppresses another; None for the model's own.
         detections_per_img: so many of the best scores are kept; None for the model's own.
+        num_growths: how often boxes grow where masks touch their sides, see `grow_boxes`.
 
     Returns:
         The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
@@ -60,9 +66,29 @@ def run_heads(
         features = OrderedDict((level, values.to(dtype)) for level, values in features.items())
         proposals, _ = model.rpn(resized, features)
         (detections,), _ = heads(features, proposals, resized.image_sizes)
-    height, width = resized.image_sizes[0]
+        height, width = resized.image_sizes[0]
+        for _ in range(num_growths):
+            boxes = grow_boxes(detections, (width, height))
+            is_new = (boxes != detections["boxes"]).any(1)
+            pooled = heads.mask_roi_pool(features, [boxes[is_new]], resized.image_sizes)
+            (masks,) = maskrcnn_inference(heads.mask_predictor(heads.mask_head(pooled)), [detections["labels"][is_new]])
+            every = detections["masks"].masked_scatter(is_new[:, None, None, None], masks)
+            detections = detections | {"boxes": boxes, "masks": every}
+            stays = batched_nms(boxes, detections["scores"], detections["labels"], heads.nms_thresh)
+            detections = {key: values[stays] for key, values in detections.items()}
     floats = {key: detections[key].float() for key in ("boxes", "scores", "masks")}
     return decide_masks(detections | floats) | {"frame": torch.tensor([width, height])}
+
+
+def grow_boxes(detections: dict[str, Tensor], size: tuple[int, int]) -> Tensor:
+    """(D, 4) xyxy boxes whose sides move out where masks touch them, within the frame (`size`: width, height). A mask
+    ends at its box; one that is cut off there shows the rest in a larger one."""
+    inside = (decide_masks(detections)["masks"][:, 0] > CUT).float()
+    sides = torch.stack([inside[:, :, 0], inside[:, 0], inside[:, :, -1], inside[:, -1]], 1).mean(2)
+    boxes, (width, height) = detections["boxes"], size
+    spans = boxes[:, 2:] - boxes[:, :2]
+    grown = boxes + GROWTH * torch.cat((-spans, spans), 1) * (sides > TOUCHED)
+    return torch.minimum(grown.clamp(min=0), grown.new_tensor([width, height, width, height]))
 
 
 def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.models.detection.roi_heads import maskrcnn_inference, paste_masks_in_image
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from mvseg.detectors.mask_cut import decide_masks
-from mvseg.detectors.run import detect, normalize, run_heads
+from mvseg.detectors.run import GROWTH, detect, grow_boxes, normalize, run_heads
 from mvseg.evaluation.average_precision import annotate_detections
 from tiny_training import build_tiny
 
@@ -71,6 +71,34 @@ def test_other_thresholds_for_one_call_only(model: torch.nn.Module, photo: Tenso
     assert len(run_heads(model, photo, detections_per_img=2)["scores"]) == 2 < before
     assert (heads.nms_thresh, heads.detections_per_img) == (0.2, 100)
     assert len(run_heads(model, photo)["scores"]) == before
+
+
+def test_a_box_grows_where_its_mask_touches_it() -> None:
+    """And only there, within the frame: a mask in the middle, one at the left side, one at the bottom of the frame."""
+    masks = torch.full((3, 1, 8, 8), 0.01)
+    masks[0, 0, 2:6, 2:6] = masks[1, 0, 2:6, :6] = masks[2, 0, 2:, 2:6] = 0.99
+    boxes = torch.tensor([[20.0, 20.0, 40.0, 30.0]] * 2 + [[20.0, 20.0, 40.0, 49.0]])
+    grown = grow_boxes({"boxes": boxes, "masks": masks, "scores": torch.ones(3)}, (90, 50))
+    expected = boxes.clone()
+    expected[1, 0] -= GROWTH * 20
+    expected[2, 3] = 50
+    torch.testing.assert_close(grown, expected)
+
+
+@torch.no_grad()
+def test_the_mask_head_looks_again_in_boxes_that_grow(model: torch.nn.Module, photo: Tensor) -> None:
+    """Against the plain run, box by box."""
+    model.roi_heads.nms_thresh = 1.0
+    plain, found = (run_heads(model, photo, num_growths=number) for number in (0, 1))
+    width, height = plain["frame"].tolist()
+    grown = grow_boxes(plain, (width, height))
+    assert (grown != plain["boxes"]).any()
+    assert torch.equal(found["boxes"], grown)
+    resized, _ = model.transform([photo])
+    features, heads = {"0": model.backbone(resized.tensors)}, model.roi_heads
+    pooled = heads.mask_roi_pool(features, [grown], resized.image_sizes)
+    masks = maskrcnn_inference(heads.mask_predictor(heads.mask_head(pooled)), [plain["labels"]])[0]
+    torch.testing.assert_close(found["masks"], decide_masks({"masks": masks, "scores": plain["scores"]})["masks"])
 
 
 @torch.no_grad()
