@@ -48,13 +48,6 @@ def square(number: int) -> tuple[int, int, str | None]:
     return number**2, os.getpid(), os.environ.get("OMP_NUM_THREADS")
 
 
-class Unpicklable:
-    """Ends the process that unpickles it."""
-
-    def __reduce__(self) -> tuple[object, tuple[int]]:
-        return os._exit, (5,)
-
-
 def do_as_told(item: str, *_: object) -> tuple[str, int]:
     """The word in capitals and the number of the process; "verb:argument" does something else before."""
     verb, _, argument = item.partition(":")

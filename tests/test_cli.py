@@ -282,8 +282,9 @@ def test_the_papers_config_serves_both_verbs(plant: Path, tmp_path: Path) -> Non
         assert json.loads((folder / "run.json").read_text())["config"]["match"]["method"] == "symnmf"
 
 
-def test_no_stage_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_stage_is_silent(tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every stage that takes minutes on a large scene has a bar, matching between detections and shapes too."""
+    monkeypatch.setattr("mvseg.system.progress.LINE_SECONDS", -1.0)
     plant = write_scene(tmp_path / "plant", 3)
     options = [*SMALL, "--detect.min_score", "0.05", "--out", str(tmp_path / "out"), *COARSE[:-2]]
     assert main(["infer", str(plant), *options]) == 0

@@ -20,7 +20,7 @@ from mvseg.errors import InputError
 from mvseg.results.earlier import Output, check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 from mvseg.system.running import progress_bar
-from mvseg.system.say import say_beside_bars
+from mvseg.system.say import say
 
 SHOWN = 4  # limit: names of running scenes beside the progress bar
 
@@ -116,7 +116,8 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
 
     def show() -> None:
         more = f" and {len(running) - SHOWN} more" if len(running) > SHOWN else ""
-        bar.set_postfix_str(", ".join(list(running.values())[:SHOWN]) + more)
+        bar.beside = "".join(f", {name}" for name in list(running.values())[:SHOWN]) + more
+        bar.update(0)
 
     def start(index: int) -> None:
         running[index] = scenes[index].name
@@ -131,12 +132,13 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
                         del running[index]
                         show()
                         if isinstance(answer, Lost) and items is waiting:
-                            say_beside_bars(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
+                            sentence = f"the process {answer.reason}; it is tried again"
+                            say(f"mvseg: {scenes[index].name}: {sentence}", to_stderr=True)
                             again.append(index)
                             continue
                         finished[index] = _give_up(scenes[index], answer, out) if isinstance(answer, Lost) else answer
                         if finished[index].status.state == "failed":
-                            say_beside_bars(f"{scenes[index].name}: {finished[index].status.sentence}")
+                            say(f"mvseg: {scenes[index].name}: {finished[index].status.sentence}", to_stderr=True)
                         bar.update()
             finally:
                 for index in running:  # killed workers did not clean up

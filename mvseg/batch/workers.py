@@ -1,8 +1,7 @@
 """Workers that go through a list of items: processes of this machine, or those of a Dask cluster.
 
-A pool of `concurrent.futures` breaks when one of its processes is killed. So each local process is a pool of its own:
-if it dies, only its own item is lost. The workers of a cluster are on other machines, started by Slurm, PBS or by hand;
-they need the same mvseg, and the same paths to scenes and results: a shared disk.
+A local process that dies loses only its own item. The workers of a cluster are on other machines, started by Slurm,
+PBS or by hand; they need the same mvseg, and the same paths to scenes and results: a shared disk.
 """
 
 from __future__ import annotations
@@ -13,17 +12,16 @@ import signal
 import threading
 import uuid
 from collections.abc import Callable, Generator, Iterator, Mapping
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from mvseg.errors import InputError
-from mvseg.system.sigterm import held_back
-from mvseg.system.worker_pool import start_pool
+from mvseg.system.worker_pool import receive, run_each, start_workers
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -63,55 +61,30 @@ def run_locally(
     """The answers of `work` in the order in which they come, each with the key of its item.
 
     At most `num_workers`, >= 1, are spawned; they use one thread, and end with this process, however that ends. When
-    the iterator is closed early, they are stopped at once. Raises InputError if none can be started.
+    the iterator is closed early, they are stopped at once.
 
     Args:
         work: what a module holds, or `partial` of it.
         items: items that can be pickled, by key.
         started: called with the key of an item when a worker takes it.
     """
-    todo = dict(items)
-    asked: dict[Future[Any], tuple[int | None, ProcessPoolExecutor]] = {}  # None: whether the worker has started
-    with ExitStack() as stack:
-        for _ in range(min(num_workers, len(items))):
-            asked |= _start_worker(stack.enter_context(start_pool(1)), work)
-        while asked:
-            for future in wait(asked, return_when=FIRST_COMPLETED).done:
-                key, worker = asked.pop(future)
-                error = future.exception()
-                has_died = isinstance(error, BrokenProcessPool)
-                if key is None and has_died:
-                    if not asked:
-                        raise InputError("no worker can be started: the process dies before it has anything to do")
-                    continue  # the others go on
-                if todo and has_died:
-                    asked |= _start_worker(stack.enter_context(start_pool(1)), work)
-                elif todo:
-                    following = next(iter(todo))
-                    started(following)
-                    asked[worker.submit(work, todo.pop(following))] = following, worker
-                if has_died:
-                    yield key, Lost("died, most likely because memory ran out")  # type: ignore[misc]  # is not None
-                elif key is not None:
-                    yield key, future.result() if error is None else _stopped_with(error)
+    with start_workers(num_workers) as workers:
+        for key, future in run_each(partial(_work_alone, work), items.items(), workers, started=started):
+            error = future.exception()
+            yield key, receive(future) if error is None else _lost_by(error)
 
 
-def _start_worker(
-    worker: ProcessPoolExecutor, work: Callable[[Any], Any]
-) -> dict[Future[Any], tuple[None, ProcessPoolExecutor]]:
-    # it inherits the blocked signals: Ctrl-C is left to the parent
-    with held_back(signal.SIGINT):
-        return {worker.submit(_load, work): (None, worker)}
-
-
-def _load(work: Callable[[Any], Any]) -> None:
-    """In a worker: import the modules that `work` needs, and pycolmap without its handler of SIGTERM."""
+def _work_alone(work: Callable[[Item], Answer], item: Item) -> Answer:
+    """Work in a process whose main thread this is; pycolmap's handler of SIGTERM, which its import sets, goes."""
     import pycolmap  # noqa: F401
 
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    return work(item)
 
 
-def _stopped_with(error: BaseException) -> Lost:
+def _lost_by(error: BaseException) -> Lost:
+    if isinstance(error, BrokenProcessPool):
+        return Lost("died, most likely because memory ran out")
     return Lost(f"stopped with {type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -196,7 +169,7 @@ def _read_answer(future: Any, client: Client) -> Any:
         return future.result()
     if type(error).__name__ == "KilledWorker":
         return Lost("died with its worker, most likely because memory ran out; see the worker's log")
-    return _stopped_with(error)
+    return _lost_by(error)
 
 
 def _build_plugin() -> Any:

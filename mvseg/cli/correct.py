@@ -57,7 +57,7 @@ def run(args: Namespace) -> int:
         computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:
             computing.start()
-            load_ahead(now.workers, num_workers, "mvseg.reconstruction.surface.fit_surfaces")
+            load_ahead(now.workers, "mvseg.reconstruction.surface.fit_surfaces")
             say(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.")
             if not args.no_browser:
                 webbrowser.open(server.address)

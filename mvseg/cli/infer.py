@@ -14,7 +14,7 @@ from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
 from mvseg.system.running import now_running
-from mvseg.system.say import say
+from mvseg.system.say import say, show_line
 
 if TYPE_CHECKING:
     from mvseg.runs.request import RunRequest
@@ -35,7 +35,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     if now_running().progress and sys.stderr.isatty():
-        say("mvseg: starting", to_stderr=True, end="\r")  # the imports take seconds
+        show_line("mvseg: starting")  # the imports take seconds
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.runs.request import RunRequest

@@ -31,7 +31,7 @@ from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
 from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
-from mvseg.system.running import expected_minutes, report_step, timed
+from mvseg.system.running import report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import ViewLabels, label_views
 from mvseg.verification.leaf_scores import order_ratings
@@ -77,8 +77,7 @@ def learn(
                 warn(Finding("learned_too_few", values={"count": labels.num_leaves, "least": CHOICE.least_leaves}))
                 break
             if number == 1 and rounds is None:
-                how_long = f"{expected_minutes('learn')} a round; Ctrl-C keeps what is found"
-                report_step(f"the detector does not know this species, and learns it from the views: {how_long}")
+                report_step("the detector learns this species from the views; Ctrl-C keeps what is found")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             taught = _learn_once(best, labels, cache)
             before, after = best.rating, taught.rate_by(best)
@@ -118,11 +117,11 @@ def _is_smaller(plant: Plant) -> bool:
 def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Plant:
     opened = plant.opened
     path = cache.learned(_describe(plant, labels))
-    if not path.is_file():
-        with timed("learn"):
+    with timed("learn"):  # a round begins, also where it was learned before
+        if not path.is_file():
             content = _fine_tune(plant, labels)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, lambda partial: partial.write_bytes(content))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, lambda partial: partial.write_bytes(content))
     detect = replace(opened.config.detect, weights=str(path))
     found = run_near(plant, detect, cache=cache)
     with collect_warnings():

@@ -30,6 +30,8 @@ from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.running import now_running, running, timed
 from mvseg.system.say import say
 
+PASSES = 3  # chosen: sizes that the detector looks at, of most plants that it does not know, and in each round
+
 
 @dataclass(frozen=True, eq=False)
 class Solved:
@@ -83,10 +85,16 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
                 say(f"mvseg: {word}: {sentence}", to_stderr=True)
 
 
-def _plan_stages(config: RunConfig, *, finds: bool) -> tuple[str, ...]:
-    first = ("load", "detect", "match", "choose") if finds else ("load", "match")
+def _plan_stages(config: RunConfig, *, finds: bool) -> list[str]:
+    """Plan the stages of a run: all rounds of learning that it may need, and the passes that most need."""
+    first = ["match", "choose"]
+    if finds:
+        from mvseg.pipeline.learn import ROUNDS  # loads torchvision
+
+        first = ["detect", *first] * (PASSES if config.detect.image_size is None else 1)
+        first += ["snap", "learn", *first] * int({"off": 0, "auto": ROUNDS}.get(str(config.learn), config.learn))
     shapes, traits = (("snap", "surfaces"), ("voxels", "measure")) if config.reconstruct is not None else ((), ())
-    return (*first, *shapes, "check", *traits, "write")
+    return ["load", *first, *shapes, "check", *traits, "write"]
 
 
 def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:

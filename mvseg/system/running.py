@@ -5,22 +5,17 @@ Stages ask here, so that no signature hands it on (as with `decimal.localcontext
 
 from __future__ import annotations
 
-import math
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager, nullcontext
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from tqdm import tqdm
-
-from mvseg.system.say import say, say_beside_bars
+from mvseg.system.progress import NETWORKS, Progress
+from mvseg.system.say import say, show_line
 from mvseg.system.threads import on_one_thread
-from mvseg.system.whole_command import EXPECTED, WholeCommand
-from mvseg.system.worker_pool import start_workers
+from mvseg.system.worker_pool import Workers, start_workers
 
 
 @dataclass(frozen=True)
@@ -28,30 +23,24 @@ class Running:
     """How a run works.
 
     Attributes:
-        progress: show progress bars, and lines that say what was done.
-        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
+        progress: how far the command is, and lines that say what was done; None: silent.
+        workers: processes that surfaces are fitted in, see `start_workers`; up to one: this one.
         seconds: {stage: wall time}, see `timed`.
         is_cancelled: asked before each stage, see `timed`.
         report: progress callback; None disables it.
-        told: names of the progress bars that have a line already, where there is no terminal.
-        whole: how far the command is, of which this is a part; None: nobody asks.
     """
 
-    progress: bool = False
-    workers: ProcessPoolExecutor | None = None
+    progress: Progress = field(default_factory=Progress, compare=False)
+    workers: Workers = ()
     seconds: dict[str, float] = field(default_factory=dict, compare=False)
     is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
     report: Callable[[str], None] | None = field(default=None, compare=False)
-    told: set[str] = field(default_factory=set, compare=False)
-    whole: WholeCommand | None = field(default=None, compare=False)
 
 
 class Cancelled(Exception):
     """The run is not wanted any more."""
 
 
-NETWORKS = "detect", "learn"  # definition: stages that networks work in
-LINE_SECONDS = 60.0  # limit: between two lines of one stage
 SILENT = Running()
 _NOW: ContextVar[Running] = ContextVar("mvseg_running")
 
@@ -85,26 +74,16 @@ def running(
         InputError: fewer than one process.
     """
     outside = now_running()
+    given: dict[str, Any] = {"is_cancelled": is_cancelled, "report": report}
     with ExitStack() as stack:
-        workers = outside.workers if num_workers is None else stack.enter_context(start_workers(num_workers))
-        is_shown = outside.progress if progress is None else progress
-        cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
-        told = outside.told if outside.progress else set()
-        report = outside.report if report is None else report
-        whole = outside.whole
-        if plan and is_shown:
-            whole = WholeCommand(plan)
-            stack.callback(whole.close)
-        now = Running(
-            progress=is_shown,
-            workers=workers,
-            is_cancelled=cancelled,
-            report=report,
-            told=told,
-            whole=whole,
-        )
-        stack.callback(_NOW.reset, _NOW.set(now))
-        yield now
+        if plan or progress not in (None, bool(outside.progress)):
+            given["progress"] = Progress(plan, is_shown=bool(outside.progress if progress is None else progress))
+            stack.callback(show_line, "")
+        if num_workers is not None:
+            given["workers"] = stack.enter_context(start_workers(num_workers))
+        changes = {name: value for name, value in given.items() if value is not None}
+        stack.callback(_NOW.reset, _NOW.set(replace(outside, seconds={}, **changes)))
+        yield now_running()
 
 
 @contextmanager
@@ -114,96 +93,62 @@ def timed(stage: str) -> Iterator[None]:
     now = now_running()
     if now.is_cancelled():
         raise Cancelled
-    if now.whole is not None:
-        now.whole.begin(stage)
+    now.progress.begin(stage)
     begun = time.perf_counter()
     with nullcontext() if stage in NETWORKS else on_one_thread():
         yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
+    if now.progress.total:
+        now.progress.end(stage)
 
 
 def report_step(sentence: str) -> None:
-    """Report the present step to the callback of the run, or print it beside the bars; nothing in a silent run."""
+    """Report the present step to the callback of the run, or print it; nothing in a silent run."""
     if (report := now_running().report) is not None:
         report(sentence)
     elif now_running().progress:
-        say_beside_bars(sentence)
+        say(f"mvseg: {sentence}", to_stderr=True)
 
 
-def expected_minutes(stage: str) -> str:
-    """Expected time of a stage, in words: the measured ratio to detection, times the time of detection."""
-    seconds = now_running().seconds.get("detect", 0.0) * EXPECTED[stage] / EXPECTED["detect"]
-    return f"some {max(1, round(seconds / 60))} minutes"
+@dataclass
+class progress_bar:
+    """Count items, or `update` as often as wanted, in the one line of the command. The callback of the run is told of
+    each item, and then the run may be cancelled."""
 
-
-def progress_bar(
-    items: Iterable[Any] | None = None, name: str = "", total: int | None = None, *, unit: str = "step"
-) -> Any:
-    """tqdm's bar with a name in front, hidden where the run is silent. On a terminal, each takes the line of the one
-    before; in a file or a pipe, each name has a line at its end, and one a minute until then."""
-    now = now_running()
-    if now.report is not None or (now.progress and now.whole is not None):
-        return _Part(items, name, total, unit=unit)
-    if not now.progress or sys.stderr.isatty():
-        form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
-        return tqdm(items, name, total, unit=unit, bar_format=form, leave=False, disable=not now.progress)
-    is_told = name in now.told
-    now.told.add(name)
-    form = f"{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
-    return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
-
-
-class _Part:
-    """A bar of one stage: reported, or part of the command's line; in a file or a pipe, a line at its first end."""
-
-    def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, *, unit: str) -> None:
-        self.items, self.name, self.unit, self.n = items, name, unit, 0
-        self.total = len(items) if total is None and isinstance(items, Sized) else total
+    items: Iterable[Any] = ()
+    name: str = ""
+    total: int | None = None
+    unit: str = "step"
+    beside: str = ""
+    n: int = 0
+    progress: Progress = field(default_factory=lambda: now_running().progress)  # other threads may count, too
 
     def __iter__(self) -> Iterator[Any]:
+        if self.total is None and isinstance(self.items, Sized):
+            self.total = len(self.items)
+        now = now_running()
         with self:
-            for item in self.items or ():
-                if (now := now_running()).report is not None:
+            for item in self.items:
+                if now.report is not None:
                     if now.is_cancelled():
                         raise Cancelled
                     now.report(f"{self.name}: {self.unit} {self.n + 1} of {self.total}")
                 yield item
                 self.update()
 
-    def __enter__(self) -> _Part:
-        self.update(0)
+    def __enter__(self) -> progress_bar:
+        if not self.progress.total:
+            self.progress.begin(self.name)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._show(ends=True)
-        now = now_running()
-        if now.whole is not None and not sys.stderr.isatty() and self.name not in now.told:
-            now.told.add(self.name)
-            say(now.whole.text, to_stderr=True)
+        self.update(0, ends=True)
+        if not self.progress.total:
+            self.progress.end(self.name)
 
-    def update(self, more: int = 1) -> None:
+    def update(self, more: int = 1, *, ends: bool = False) -> None:
+        """Count more; show what stands `beside` it."""
         self.n += more
-        self._show(ends=False)
-
-    def _show(self, *, ends: bool) -> None:
-        if (whole := now_running().whole) is not None:
-            count = f" of {self.total}" if self.total else ""
-            part = min(1.0, self.n / self.total) if self.total else 0.0
-            whole.advance(part, f"{self.name}: {self.unit} {self.n}{count}", ends=ends)
-
-
-class _Lines(tqdm):  # type: ignore[misc]  # it has no types
-    said_at = math.inf
-
-    def __init__(self, *what: Any, **how: Any) -> None:
-        super().__init__(*what, **how)
-        self.said_at = time.monotonic()
-
-    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
-        """At the end, `pos` is 0, and tqdm ends the line."""
-        if pos == 0:
-            self.fp.write(str(self))
-        elif time.monotonic() - self.said_at > LINE_SECONDS:
-            self.fp.write(f"{self}\n")
-            self.said_at = time.monotonic()
-        return True
+        count = f" of {self.total}" if self.total else ""
+        part = min(1.0, self.n / self.total) if self.total else 0.0
+        self.progress.show(f"{self.name}: {self.unit} {self.n}{count}{self.beside}", part, ends=ends)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import sys
+from shutil import get_terminal_size
 
 # Control characters but line feed and tab, and those that turn the direction of text.
 CONTROL = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+_line = ""  # at the bottom of the terminal
 
 
 def plain(text: str) -> str:
@@ -15,12 +17,17 @@ def plain(text: str) -> str:
 
 
 def say(text: object = "", *, to_stderr: bool = False, end: str = "\n") -> None:
-    """Print on stdout, or on stderr, at once."""
+    """Print on stdout, or on stderr, at once, in place of the line of `show_line`."""
+    if _line:
+        show_line("")
     print(plain(str(text)), end=end, file=sys.stderr if to_stderr else sys.stdout, flush=True)
 
 
-def say_beside_bars(sentence: str) -> None:
-    """Print "mvseg: " and a sentence on stderr, above the progress bars, which stay where they are."""
-    from tqdm import tqdm  # whoever shows bars has it; others need not load it to say a word
-
-    tqdm.write(f"mvseg: {plain(sentence)}", file=sys.stderr)
+def show_line(text: str) -> None:
+    """Show one line on stderr: at the bottom of a terminal, in place of the one before, which "" takes away."""
+    global _line
+    if sys.stderr.isatty() and (text or _line):
+        earlier, _line = _line, plain(text)[: get_terminal_size().columns - 1]
+        print(f"\r{' ' * len(earlier)}\r{_line}", end="", file=sys.stderr, flush=True)
+    elif text:
+        say(text, to_stderr=True)

@@ -6,15 +6,13 @@ import os
 import signal
 import time
 from contextlib import closing
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from batch_work import Unpicklable, do_as_told, start_lightly
+from batch_work import do_as_told, start_lightly
 from mvseg.batch.workers import Lost, run_locally
-from mvseg.errors import InputError
 
 
 def run(items: list[str], num_workers: int) -> tuple[dict[int, Any], list[int]]:
@@ -58,12 +56,6 @@ def test_the_last_item_may_kill_its_process(light: None) -> None:
 
 def test_nothing_to_do() -> None:
     assert run([], 2) == ({}, [])
-
-
-def test_workers_that_cannot_start_are_an_error(light: None) -> None:
-    work = partial(do_as_told, Unpicklable())  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"^no worker can be started: the process dies before"):
-        list(run_locally(work, {0: "a", 1: "b"}, int, num_workers=2))
 
 
 def test_workers_end_when_the_caller_has_enough(light: None, tmp_path: Path) -> None:

@@ -16,20 +16,19 @@ import torch
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from mvseg.errors import InputError
-from mvseg.system.running import NETWORKS, Running, expected_minutes, now_running, progress_bar, running, timed
+from mvseg.system.progress import EXPECTED, NETWORKS
+from mvseg.system.running import SILENT, now_running, progress_bar, report_step, running, timed
 from mvseg.system.threads import on_one_thread
 
 
 def test_it_holds_inside_only_and_nests() -> None:
-    assert now_running() == Running(progress=False, workers=None)
     with running(progress=True):
         with running(num_workers=2):
-            assert now_running().progress
-            assert now_running().workers is not None
+            assert (bool(now_running().progress), len(now_running().workers)) == (True, 2)
             with running(progress=False, num_workers=1):
-                assert now_running() == Running()
-        assert now_running() == Running(progress=True)
-    assert now_running() == Running()
+                assert (bool(now_running().progress), len(now_running().workers)) == (False, 1)
+        assert (bool(now_running().progress), now_running().workers) == (True, ())
+    assert not now_running().progress
 
 
 def test_it_ends_with_an_error() -> None:
@@ -37,14 +36,14 @@ def test_it_ends_with_an_error() -> None:
         pass
     with pytest.raises(KeyboardInterrupt), running(progress=True):
         raise KeyboardInterrupt
-    assert now_running() == Running()
+    assert now_running() is SILENT
 
 
 def test_threads_know_of_it_if_they_run_in_its_context() -> None:
     seen: list[bool] = []
 
     def look() -> None:
-        seen.append(now_running().progress)
+        seen.append(bool(now_running().progress))
 
     with running(progress=True):
         for thread in (threading.Thread(target=look), threading.Thread(target=copy_context().run, args=(look,))):
@@ -59,7 +58,7 @@ def test_bars_are_silent_by_default(capsys: pytest.CaptureFixture[str]) -> None:
     with running(progress=True):
         for _ in range(2):  # one line, in a file or a pipe
             assert list(progress_bar(range(3), "counting", unit="sheep")) == [0, 1, 2]
-    assert re.fullmatch(r"counting: 100% of 3 sheeps, 00:0\d\n", capsys.readouterr().err)
+    assert capsys.readouterr().err == "counting: sheep 3 of 3, 00:00 left\n"
 
 
 class Terminal(io.StringIO):
@@ -67,57 +66,72 @@ class Terminal(io.StringIO):
         return True
 
 
+def open_terminal(monkeypatch: pytest.MonkeyPatch) -> Terminal:
+    monkeypatch.setattr("mvseg.system.progress.TERMINAL_SECONDS", -1.0)
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    return terminal
+
+
 def test_on_a_terminal_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    terminal = open_terminal(monkeypatch)
     with running(progress=True):
-        for name in ("match", "pictures"):
-            assert list(progress_bar(range(3), name, unit="view")) == [0, 1, 2]
-    assert "match: view 0 of 3, ? left" in terminal.getvalue()
-    assert "pictures: view 0 of 3, ? left" in terminal.getvalue()
-    assert "\n" not in terminal.getvalue()
-    assert terminal.getvalue().endswith(" \r")
+        assert list(progress_bar(range(3), "match", unit="view")) == [0, 1, 2]
+        with progress_bar(total=3, name="pictures", unit="view") as bar:
+            (thread := threading.Thread(target=bar.update)).start()  # of a library
+            thread.join()
+        report_step("this stays")
+    assert "\rmatch: view 3 of 3, 00:00 left" in terminal.getvalue()
+    assert "\rpictures: view 1 of 3" in terminal.getvalue()
+    assert terminal.getvalue().endswith(" \rmvseg: this stays\n")
 
 
-PLAN = ("detect", "match", "choose", "write")
+ROUND = ("snap", "learn", "detect", "match", "choose")
+PLAN = ("load", *ROUND[2:] * 2, *ROUND, *ROUND, "snap", "surfaces", "write")
 
 
-def shown_lines(text: str) -> tuple[list[int], list[str]]:
-    """Percentages and words of lines of a whole command."""
-    found = re.findall(r"(\d+)%(?:, [\d:]+ left)?: ([^\r\n]+)", text)
-    return [int(share) for share, _ in found], [words.strip() for _, words in found]
+def run_stages(*stages: str) -> None:
+    for stage in stages:
+        with timed(stage), progress_bar(total=4, name=stage, unit="view") as bar:
+            bar.update(4)
 
 
-def test_a_command_has_one_line_that_never_goes_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A run may repeat stages, and learn, which nobody planned; a stage that does not come is left out."""
-    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
-    monkeypatch.setattr("mvseg.system.whole_command.REFRESH_SECONDS", 0.0)
+@pytest.mark.parametrize(("passes", "rounds"), [(1, 0), (2, 2), (5, 0), (5, 1), (1, 2)])
+def test_a_command_never_goes_back(passes: int, rounds: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer and with more passes of the detector than planned, and rounds that are not needed."""
+    terminal = open_terminal(monkeypatch)
     with running(progress=True, plan=PLAN), running():
-        for stage in ("detect", "match", "detect", "match", "choose", "learn", "detect", "match", "write"):
-            with timed(stage):
-                list(progress_bar(range(3), stage, unit="view"))
-                list(progress_bar(iter("ab"), "letters", unit="letter"))
-    shares, words = shown_lines(terminal.getvalue())
+        run_stages("load", *ROUND[2:] * passes)
+        assert int(re.findall(r"(\d+)%", terminal.getvalue())[-1]) < 20
+        for _ in range(rounds):
+            run_stages(*ROUND[:2], *ROUND[2:] * passes)
+        run_stages("snap", "surfaces", "write")
+    shares = [int(share) for share in re.findall(r"(\d+)%", terminal.getvalue())]
     assert shares == sorted(shares)
-    assert 80 < shares[-1] < 100
-    assert {"detect: view 2 of 3", "learn", "learn: view 3 of 3", "letters: letter 2"} <= set(words)
+    assert 98 < shares[-1] <= 100
     assert "\n" not in terminal.getvalue()
 
 
-def test_in_a_pipe_each_bar_has_a_line_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_time_left_follows_from_the_stages_that_are_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, now = open_terminal(monkeypatch), [0.0]
+    monkeypatch.setattr("mvseg.system.progress.time.monotonic", lambda: now[0])
+    with running(progress=True, plan=("detect", "learn", "write")):
+        with timed("detect"):
+            now[0] += 12 * EXPECTED["detect"]
+        run_stages("learn")
+    seconds = round(12 * (EXPECTED["learn"] + EXPECTED["write"]))
+    assert f"5%, {seconds // 60}:{seconds % 60} left: learn" in terminal.getvalue()
+
+
+def test_a_pipe_has_lines(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One at the end of each stage, and one every half minute."""
     with running(progress=True, plan=PLAN):
-        for stage in ("detect", "match", "detect", "match", "choose"):
-            with timed(stage), progress_bar(total=4, name=stage, unit="view") as bar:
-                bar.update(4)
-    shares, words = shown_lines(capsys.readouterr().err)
-    assert words == [f"{stage}: view 4 of 4" for stage in ("detect", "match", "choose")]
-    assert shares == sorted(shares)
-    assert shares[-1] < 100
-
-
-def test_how_long_learning_will_take_follows_from_detection() -> None:
-    with running() as now:
-        now.seconds["detect"] = 60.0
-        assert expected_minutes("learn") == "some 3 minutes"
+        run_stages("load", "detect", "match", "match", "choose", "detect")
+        monkeypatch.setattr("mvseg.system.progress.LINE_SECONDS", -1.0)
+        run_stages("match")
+    said = re.findall(r": (.*)", capsys.readouterr().err)
+    ends = [f"{stage}: view 4 of 4" for stage in ("load", "detect", "match", "choose", "detect", "match")]
+    assert [line for line in said if line in ends][: len(ends)] == ends
+    assert "match" in said  # as it begins
 
 
 def test_steps_are_reported_also_where_there_are_none_or_they_cannot_be_counted() -> None:

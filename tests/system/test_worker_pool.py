@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from multiprocessing import active_children
@@ -23,14 +22,14 @@ from mvseg.errors import InputError
 from mvseg.reconstruction.numbers import SEARCH
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.system.running import running
-from mvseg.system.worker_pool import default_workers, load_ahead, map_in_order, run_all, start_workers
+from mvseg.system.worker_pool import AHEAD, Workers, default_workers, load_ahead, map_in_order, run_all, start_workers
 from warned import warns_of
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
 
 
 @pytest.fixture(scope="module")
-def workers() -> Iterator[ProcessPoolExecutor | None]:
+def workers() -> Iterator[Workers]:
     with ExitStack() as stack:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr("mvseg.system.worker_pool._start_worker", start_lightly)
@@ -38,15 +37,21 @@ def workers() -> Iterator[ProcessPoolExecutor | None]:
         yield workers
 
 
-def test_answers_come_in_order_from_other_processes(workers: ProcessPoolExecutor) -> None:
+def test_few_answers_wait_for_a_slow_item(workers: Workers) -> None:
+    naps = iter([0.5, *[0.0] * 99])
+    assert next(map_in_order(nap, naps, workers)) is None
+    assert 2 < 100 - len(list(naps)) <= 1 + AHEAD
+
+
+def test_answers_come_in_order_from_other_processes(workers: Workers) -> None:
     answers = list(map_in_order(square, range(40, 80), workers))
     assert [square for square, _, _ in answers] == [number**2 for number in range(40, 80)]
     assert os.getpid() not in {process for _, process, _ in answers}
     assert {threads for _, _, threads in answers} == {"1"}
-    assert [square for square, _, _ in map_in_order(square, range(3), None)] == [0, 1, 4]
+    assert [square for square, _, _ in map_in_order(square, range(3), workers[:1])] == [0, 1, 4]
 
 
-def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor) -> None:
+def test_warnings_and_errors_are_those_of_the_work(workers: Workers) -> None:
     with warns_of("dark_photo"):
         assert next(map_in_order(square, [7], workers))[0] == 49
     with pytest.raises(InputError, match=r"^13 brings bad luck$"):
@@ -75,9 +80,7 @@ def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> No
     regions, ids = as_regions(blade_masks(EllipticBlade(), cameras))
     here = fit_surfaces(regions, ids, cameras)[1]
     with running(num_workers=2) as now:
-        assert now.workers is not None
-        load_ahead(now.workers, 1, fit_surfaces.__module__)
-        assert len(now.workers._processes) == 1  # it loads while nobody waits
+        load_ahead(now.workers, fit_surfaces.__module__)  # while nobody waits
         there = fit_surfaces(regions, ids, cameras)[1]
     assert here.exists
     assert torch.equal(here.coefficients, there.coefficients)
@@ -114,7 +117,5 @@ def test_a_killed_worker_is_said_and_none_is_left() -> None:
 
 def test_how_many() -> None:
     assert 1 <= default_workers() <= 4
-    with start_workers(1) as workers:
-        assert workers is None
     with pytest.raises(InputError, match=r"^num_workers is 0, expected at least 1$"), start_workers(0):
         pass

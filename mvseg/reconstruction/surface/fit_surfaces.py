@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import chain
 from types import MappingProxyType
@@ -37,7 +36,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.threads import on_one_thread
-from mvseg.system.worker_pool import map_in_order
+from mvseg.system.worker_pool import Workers, map_in_order
 
 
 @check_arguments
@@ -79,7 +78,7 @@ def fit_surfaces(
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
     cache = SurfaceCache() if cache is None else cache
-    workers = now_running().workers if len(regions) >= SEARCH.few_masks else None
+    workers = now_running().workers if len(regions) >= SEARCH.few_masks else ()
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = instance_frames(regions, instance_ids, cameras)
     surfaces: dict[int, LeafSurface] = {}
@@ -134,7 +133,7 @@ def _fit_new(
     cache: dict[str, Any],
     asked: Mapping[str, Any],
     fit: Callable[[Sequence[Any]], list[Any]],
-    workers: ProcessPoolExecutor | None,
+    workers: Workers,
 ) -> None:
     """Fit the leaves that the cache lacks, `SEARCH.at_once` at a time."""
     new = {name: each for name, each in asked.items() if name not in cache}
