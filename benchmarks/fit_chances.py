@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -26,12 +27,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.fit_costs import small_specs
 from benchmarks.tracking import read_places, see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Alignment, Habit, Poses, judge, list_poses, pose_gain, refine_alignment
+from mvseg.tracking.align import Alignment, Poses, list_poses, pose_odds, refine_alignment
 from mvseg.tracking.associate import link_leaves
 from mvseg.tracking.compare import compare_dates
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.leaves import DateLeaves, Pair, leaves_of
-from mvseg.tracking.numbers import LINKING
+from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates
 
 NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
@@ -68,11 +69,11 @@ def is_right(seen: Seen, place: tuple[int, int], alignment: Alignment) -> bool |
 def fit_temper(plants: list[tuple[Seen, Looked]]) -> float:
     choices = []
     for seen, looked in plants:
-        habit = Habit.of([judge(poses, Habit()) for poses in looked.values()], "auto")
         for place, poses in looked.items():
             right = np.array([bool(is_right(seen, place, each)) for each in poses.refined])
             if right.any() and not right.all():
-                choices.append((poses.gains, habit.world_prior * poses.near, right))
+                by_gain = np.array([pose_odds(replace(poses.pair, still=0.0), each) for each in poses.refined])
+                choices.append((by_gain / ALIGN.temper, poses.odds - by_gain, right))
 
     def loss(x: np.ndarray) -> float:
         odds = [(float(np.exp(x[0])) * gains + prior, right) for gains, prior, right in choices]
@@ -84,15 +85,13 @@ def fit_temper(plants: list[tuple[Seen, Looked]]) -> float:
 def judge_placed(seen: Seen, looked: Looked, *, is_other: bool) -> list[Placed]:
     """Of each two dates, placed with all others: the gain of poses, the number of leaves, and whether the pose is
     right."""
-    habit = Habit.of([judge(poses, Habit()) for poses in looked.values()], "auto")
-    poses, roots, _ = place_dates(len(seen[0]), looked, habit)
+    poses, roots, _ = place_dates(len(seen[0]), looked)
     found: list[Placed] = []
     for (earlier, later), of_pair in looked.items():
         refined = refine_alignment(of_pair.pair, np.linalg.inv(poses[later]) @ poses[earlier])
         right = False if is_other else is_right(seen, (earlier, later), refined)
         if roots[earlier] == roots[later] and len(refined.pairs) and right is not None:
-            pair = of_pair.pair
-            found.append((pose_gain(pair, refined.pose), pair.fewer, right))
+            found.append((refined.gain, of_pair.pair.fewer, right))
     return found
 
 

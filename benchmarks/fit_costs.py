@@ -28,10 +28,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
-from mvseg.tracking.align import Alignment, _fit
-from mvseg.tracking.bent_costs import bend
+from mvseg.tracking.align import _fit
 from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, Scales, costs_of, fitted_costs
+from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, Scales, bend, costs_of, fitted_costs
 from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.track import track_leaves
@@ -101,8 +100,7 @@ class Joined:
 def join(known: list[Known], *, is_bent: bool) -> Joined:
     each = []
     for pair, one, other in known:
-        true = Alignment(np.eye(4), np.argwhere(one[:, None] == other))
-        first, widths = bend(pair, true) if is_bent else (pair.first, None)
+        first, widths = bend(pair, np.argwhere(one[:, None] == other)) if is_bent else (pair.first, None)
         each.append(Differences.of(replace(pair, first=first), widths, cloud=True))
     parts = {field.name: [getattr(one, field.name) for one in each] for field in fields(Differences)}
     flat = {name: np.concatenate([part.reshape(*part.shape[:-2], -1) for part in of], -1) for name, of in parts.items()}
@@ -144,9 +142,8 @@ def track_with(series: tuple[list[PlantOnDate], Labels], poses: Scales, links: S
     costs = partial(_other_costs, poses=poses, links=links)
     with (
         patch("mvseg.tracking.align.fitted_costs", costs),
-        patch("mvseg.tracking.place_dates.fitted_costs", costs),
         patch("mvseg.tracking.compare.fitted_costs", costs),
-        patch("mvseg.tracking.bent_costs.fitted_costs", costs),
+        patch("mvseg.tracking.fitted_costs.fitted_costs", costs),
     ):
         found = measure(truth, labels_of(track_leaves(dates), dates))
     return found["short"], found["long"]

@@ -33,7 +33,7 @@ def add_options(parser: ArgumentParser) -> None:
     help_plant = "name of the plant, with --times (default: what the names of its results begin with)"
     parser.add_argument("--plant", type=str | None, help=help_plant)
     parser.add_argument("--out", type=Path | None, help="folder for tables and pages (--again: the same)")
-    help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
+    help_pots = "fixed (they stand as they stood), turned (any turn is as likely as none), or auto (few are)"
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
     help_corrections = "file with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)

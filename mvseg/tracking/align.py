@@ -1,15 +1,14 @@
 """The plant of one date in the frame of another: the pot may have been turned, moved, set down askew.
 
 That the pot stands as it stood is one hypothesis among many; the others come from pairs of leaves. Each is refined on
-the leaves that it pairs. Its probability follows from how well they go together, and from how often this plant's pot is
-turned (`Habit`). The best one is taken, and its probability says how far to trust it.
+the leaves that it pairs. Its log odds follow from how well they go together, and from a prior that the pot stands. How
+far to trust the pose that is taken in the end says `guess_chance`.
 """
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
@@ -32,140 +30,79 @@ class Alignment:
 
     Attributes:
         pose: (4, 4) second_from_first, a rotation and a shift.
-        pairs: (P, 2) leaves of the two dates (rows of `Leaves`) that go together.
-        gain: how much likelier these pairs are the same leaves than strangers, a natural logarithm.
-        probability: that the pose is right, see `guess_chance`.
-        still: probability that the pot stands as it stood.
+        pairs: (P, 2) leaves of the two dates (rows of `DateLeaves`) that go together.
+        costs: (P,) of these pairs, all below 0.
     """
 
     pose: Floats
     pairs: np.ndarray
-    gain: float = 0.0
-    probability: float = 1.0
-    still: float = 0.5
-
-
-@dataclass(frozen=True)
-class Habit:
-    """How often a pot stands as on the date before: stated by the user, or estimated from the dates of a plant. `still`
-    is its probability, before anything is known of a pair of dates."""
-
-    still: float = ALIGN.still
-
-    @staticmethod
-    def of(alignments: Sequence[Alignment], pots: Pots) -> Habit:
-        """From alignments of a plant's dates; each counts as much as it is known."""
-        if pots != "auto":
-            return Habit(1.0 if pots == "fixed" else 0.0)
-        known = ALIGN.prior_pairs * ALIGN.still + sum(each.still for each in alignments)
-        return Habit(known / (ALIGN.prior_pairs + len(alignments)))
+    costs: Floats
 
     @property
-    def world_prior(self) -> float:
-        """Log of the probability that the pot was not turned, over that of any single turn."""
-        least = ALIGN.least_still
-        return math.log(max(self.still, least) / max((1 - self.still) / ALIGN.turns, least))
+    def gain(self) -> float:
+        """How much likelier the pairs are the same leaves than strangers, a natural logarithm."""
+        return float(-self.costs.sum())
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """H poses of one pair of dates, the first as it stood, that were looked at.
-
-    Attributes:
-        gains: (H,) their gains, less the cost of large new leaves.
-        near: (H,) in [0, 1], how near they are to "as it stood".
-    """
+    """H poses of one pair of dates, the first as it stood, that were looked at; `odds` (H,) see `pose_odds`."""
 
     pair: Pair
     refined: tuple[Alignment, ...]
-    gains: Floats
-    near: Floats
+    odds: Floats
 
-    def scores(self, habit: Habit) -> Floats:
-        """(H,) gains, and what the habit of the pot says."""
-        return self.gains + habit.world_prior / ALIGN.temper * self.near
-
-    def weights(self, habit: Habit) -> Floats:
-        """(H,) the poses as probabilities."""
-        scores = self.scores(habit)
-        weights = np.exp(ALIGN.temper * (scores - scores.max()))
-        return np.asarray(weights / weights.sum())
-
-    def chance(self, pose: Floats, habit: Habit) -> float:
-        """How likely a pose (4, 4) is right."""
-        if habit.still == 1:
-            return 1.0
-        if not self.pair.fewer:
-            return habit.still
-        return guess_chance(pose_gain(self.pair, pose), self.pair.fewer)
+    @property
+    def best(self) -> Alignment:
+        """The likeliest one by these two dates alone."""
+        return self.refined[int(np.round(self.odds, ALIGN.digits).argmax())]
 
 
 def list_poses(pair: Pair) -> Poses:
     """The poses of two dates, each in its own frame, that look best, and those suggested by leaves that the user links,
     each refined; where up is not known, of any rotation. Without leaves on one date, only "as it stood"."""
-    if not pair.fewer:
-        return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
-    asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.link_costs < 0)[..., None]]
-    looked_at = np.concatenate([np.eye(4)[None], *asked])
-    poses = np.concatenate([looked_at, draw_poses(pair)])
-    rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
-    refined: list[Alignment] = [_as_it_stood(pair)]
-    left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
-    while len(left) and len(refined) < ALIGN.num_refined:
-        refined.append(refine_alignment(pair, poses[left[0]]))
-        left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
-    every = np.stack([each.pose for each in refined])
-    gains = np.array([each.gain - large_new(pair, each.pairs) for each in refined])
-    return Poses(pair, tuple(refined), gains, near_world(pair, every))
+    refined = [align_at(pair, np.eye(4))]
+    if pair.fewer:
+        asked = [draw_poses(replace(pair, first=pair.first.take(row), second=pair.second.take(column)))
+                 for row, column in np.argwhere(pair.link_costs < 0)[..., None]]  # fmt: skip
+        looked_at = np.concatenate([np.eye(4)[None], *asked])
+        poses = np.concatenate([looked_at, draw_poses(pair)])
+        rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
+        left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
+        while len(left) and len(refined) < ALIGN.num_refined:
+            refined.append(refine_alignment(pair, poses[left[0]]))
+            left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
+    return Poses(pair, tuple(refined), np.array([pose_odds(pair, each) for each in refined]))
 
 
-def judge(poses: Poses, habit: Habit) -> Alignment:
-    """The best of the poses, and how likely it is."""
-    place = int(np.round(poses.scores(habit), ALIGN.digits).argmax()) if habit.still < 1 else 0
-    best, weights = poses.refined[place], poses.weights(habit)
-    still = float(weights[poses.near > np.exp(-0.5)].sum()) if poses.pair.fewer else habit.still
-    return replace(best, still=still, probability=poses.chance(best.pose, habit))
+def pose_odds(pair: Pair, alignment: Alignment) -> float:
+    """Log odds of a pose of two dates: by its gain, by large new leaves, and by the prior that the pot stands.
+
+    Leaves of the larger half that are in no pair cost something, as when a plant is turned onto its own older leaves;
+    not where all leaves of the date with fewer are in one: then large ones were missed there. The prior counts by how
+    near the pose is to "as it stood".
+    """
+    gain, near = alignment.gain, 1.0
+    if len(alignment.pairs) < pair.fewer:
+        is_large = pair.second.lengths >= np.median(pair.second.lengths)
+        gain -= ALIGN.large_new * float(np.delete(is_large, alignment.pairs[:, 1]).sum())
+    if pair.fewer:
+        near = float(np.exp(-0.5 * pose_distances(pair, np.eye(4), alignment.pose[None])[0] ** 2))
+    return ALIGN.temper * gain + pair.still * near
 
 
-def guess_chance(gain: float, leaves: int) -> float:
+def guess_chance(pair: Pair, alignment: Alignment) -> float:
     """How likely a pose is right.
 
-    Args:
-        gain: see `pose_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
-            others of the two dates says nothing more.)
-        leaves: number of leaves of the date with fewer, >= 1. They are neither independent, then the sum of their
-            evidence would count, nor all the same, then the mean would: the sum counts over the root of their number.
+    Its gain tells; that of another plant is low. (Once all dates are placed, how likely the pose is among others of the
+    two dates says nothing more.) Leaves are neither independent, then the sum of their evidence would count, nor all
+    the same, then the mean would: the sum counts over the root of the number of leaves of the date with fewer. Without
+    leaves only the prior tells.
     """
-    offset, own, strange = GUESS
-    return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
-
-
-def pose_gain(pair: Pair, pose: Floats) -> float:
-    """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers."""
-    costs = fitted_costs(pair.moved(pose))
-    return float(-costs[tuple(best_pairs(costs).T)].sum())
-
-
-def _as_it_stood(pair: Pair) -> Alignment:
-    costs = fitted_costs(pair)
-    pairs = best_pairs(costs)
-    return Alignment(np.eye(4), pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
-
-
-def large_new(pair: Pair, pairs: np.ndarray) -> float:
-    """Cost of leaves of the larger half that are in no pair, as when a plant is turned onto its own older leaves. 0
-    where all leaves of the date with fewer are in one: then large ones were missed there."""
-    if len(pairs) == pair.fewer:
-        return 0.0
-    is_large = pair.second.lengths >= np.median(pair.second.lengths)
-    return ALIGN.large_new * float(np.delete(is_large, pairs[:, 1]).sum())
-
-
-def near_world(pair: Pair, poses: Floats) -> Floats:
-    """(H,) in [0, 1], how near poses (H, 4, 4) are to "as it stood"; 1 without leaves to tell."""
     if not pair.fewer:
-        return np.ones(len(poses))
-    return np.asarray(np.exp(-0.5 * pose_distances(pair, np.eye(4), poses) ** 2))
+        return float(expit(pair.still - math.log(ALIGN.turns)))
+    offset, own, strange = GUESS
+    return float(expit(offset + (own * alignment.gain / pair.fewer - strange) * math.sqrt(pair.fewer)))
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
@@ -227,21 +164,25 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
     return np.concatenate(likeness)
 
 
+def align_at(pair: Pair, pose: Floats) -> Alignment:
+    """The leaves that go together under a pose (4, 4)."""
+    costs = fitted_costs(pair.moved(pose))
+    pairs = best_pairs(costs)
+    return Alignment(pose, pairs, costs[pairs[:, 0], pairs[:, 1]])
+
+
 def refine_alignment(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
-    pairs = np.zeros((0, 2), int)
+    now, before = align_at(pair, pose), np.zeros((0, 2), int)
     for _ in range(ALIGN.rounds):
-        costs, before = fitted_costs(pair.moved(pose)), pairs
-        pairs = best_pairs(costs)
-        if not len(pairs) or np.array_equal(pairs, before):
+        if not len(now.pairs) or np.array_equal(now.pairs, before):
             break
+        links = pair.link_costs[now.pairs[:, 0], now.pairs[:, 1]]
         # what the pairs weigh as if nobody had said that they are one leaf
-        own = np.maximum(pair.link_costs - costs, np.where(pair.link_costs < 0, ALIGN.least_weight, 0.0))
-        pose = _fit(pair, pairs, own[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
-    else:
-        costs = fitted_costs(pair.moved(pose))
-        pairs = best_pairs(costs)
-    return Alignment(pose, pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
+        weights = np.maximum(links - now.costs, np.where(links < 0, ALIGN.least_weight, 0.0))
+        fitted = _fit(pair, now.pairs, weights, start=now.pose[:3, :3])
+        before, now = now.pairs, align_at(pair, fitted)
+    return now
 
 
 def best_pairs(costs: Floats) -> np.ndarray:

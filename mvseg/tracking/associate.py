@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.compare import Comparison, Observation
+from mvseg.tracking.compare import Comparison, Observation, link_chances
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.numbers import LINKING
 
@@ -89,9 +89,7 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     other dates and the user say; for asking about leaves that are not linked."""
     chances = {}
     for pair, costs in compared.costs.items():
-        odds = np.exp(np.clip(LINKING.unlinked - costs, -LINKING.most_odds, LINKING.most_odds))
-        under_this = odds / (1 + odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds)
-        trust = compared.trust[pair]
+        under_this, trust = link_chances(LINKING.unlinked - costs), compared.trust[pair]
         chances[pair] = trust * under_this + (1 - trust) * compared.otherwise.get(pair, 0.0)
     return chances
 

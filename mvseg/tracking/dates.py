@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import math
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -187,10 +186,11 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
         for leaf in date.leaves:
             if not all(each is None or np.isfinite(each).all() for each in (leaf.midrib, leaf.normal, leaf.points)):
                 raise InputError(f"{date.scene}: leaf {leaf.leaf} has points that are no finite numbers")
-    are_iso = {_is_iso(date.written) for date in dates}
+    moments = [_read_moment(date.written) for date in dates]
+    are_iso = {isinstance(moment, datetime.datetime) for moment in moments}
     if len(are_iso) > 1:
         raise InputError("the times are numbers and ISO dates, expected one of the two for all dates of a plant")
-    if len({_has_zone(date.written) for date in dates}) > 1:
+    if len({getattr(moment, "tzinfo", None) is None for moment in moments}) > 1:
         raise InputError("some times have a time zone and others have none, expected one for all dates of a plant")
     ordered = sorted(dates, key=lambda date: date.time)
     for earlier, later in pairwise(ordered):
@@ -201,36 +201,15 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
     return tuple(replace(_in_unit(date, ordered[0]), time=date.time - start) for date in ordered)
 
 
-def _is_iso(text: str) -> bool:
-    return isinstance(_read_moment(text), datetime.datetime)
-
-
-def _has_zone(text: str) -> bool:
-    moment = _read_moment(text)
-    return isinstance(moment, datetime.datetime) and moment.tzinfo is not None
-
-
 def name_apart(dates: Sequence[PlantOnDate]) -> list[PlantOnDate]:
     """The dates, those whose results have one name with as much of their folders as tells them apart: of mon/plant and
     fri/plant just this. Results in memory keep their names."""
-    named, parts = list(dates), 1
-    while any(len(same) > 1 for same in _of_one_name(named).values()):
-        parts += 1
-        for same in _of_one_name(named).values():
-            for index in same if len(same) > 1 else ():
-                folder = named[index].folder
-                longer = "" if folder is None else "/".join(folder.resolve().parts[-parts:])
-                named[index] = replace(named[index], scene=longer or named[index].scene)
-        if parts > OBSERVATIONS.most_parts:  # the same folder twice, or results in memory
-            break
+    named, before, parts = list(dates), list[str](), 1
+    while (scenes := [date.scene for date in named]) != before:  # none changes once all differ, or no folder is longer
+        before, parts = scenes, parts + 1
+        named = [replace(date, scene="/".join(date.folder.resolve().parts[-parts:]))
+                 if date.folder is not None and scenes.count(date.scene) > 1 else date for date in named]  # fmt: skip
     return named
-
-
-def _of_one_name(dates: Sequence[PlantOnDate]) -> dict[str, list[int]]:
-    same: dict[str, list[int]] = defaultdict(list)
-    for index, date in enumerate(dates):
-        same[date.scene].append(index)
-    return same
 
 
 def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:

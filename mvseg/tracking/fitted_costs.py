@@ -1,5 +1,5 @@
 """How unlike two leaves of different dates are, by scales of greatest likelihood: for finding how dates stand to each
-other, and for linking leaves (`bent_costs.py`).
+other (`fitted_costs`), and for linking leaves, once the earlier plant is bent as the pairs say (`bent_costs`).
 
 The cost of a pair is minus the logarithm of how much likelier its differences are between two observations of one leaf
 than between a leaf and a stranger. Each difference has its own scale, widened by the surfaces' standard deviations, and
@@ -8,13 +8,13 @@ heavy tails: one odd number does not outweigh the others. With more leaves, a wr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.leaves import Pair
+from mvseg.tracking.leaves import DateLeaves, Pair
 from mvseg.tracking.numbers import COSTS, OBSERVATIONS
 
 
@@ -124,6 +124,43 @@ def fitted_costs(pair: Pair, scales: Scales = POSES, widths: Floats | None = Non
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
     likelier than not. The user's links count, too. `widths`: see `Differences`."""
     return costs_of(Differences.of(pair, widths, cloud=scales.cloud > 0), scales) + pair.link_costs
+
+
+def bent_costs(pair: Pair, pairs: np.ndarray) -> Floats:
+    """(N, M) costs of links between dates in one frame, the earlier one bent as `pairs` (P, 2) of its leaves say; below
+    0 leaves are likelier one than not."""
+    bent, widths = bend(pair, pairs)
+    return fitted_costs(replace(pair, first=bent), LINKS, widths)
+
+
+def bend(pair: Pair, pairs: np.ndarray) -> tuple[DateLeaves, Floats]:
+    """The leaves of the earlier date where the later one should show them, and (N,) factors of the scales of places.
+
+    A plant leans, and its internodes stretch: each leaf moves as those around it did, and the better these agree, the
+    more places tell. Both are regressions with a prior worth some pairs, so that only many pairs move the costs much.
+
+    The shift of a base is linear in its place: a ridge regression over the pairs, `COSTS.prior_pairs` strong, of which
+    each leaf is predicted without its own pair. Factors grow with the variance of that prediction, and with the median
+    error of all, which weighs against `COSTS.usual` as the pairs do against the prior. Without pairs nothing bends.
+    """
+    first, prior, (rows, columns) = pair.first, COSTS.prior_pairs, pairs.T
+    if not len(rows):
+        return first, np.ones(len(first))
+    away = (pair.second.bases[columns] - first.bases[rows]) / pair.scale
+    places = np.column_stack([np.ones(len(first)), (first.bases - first.bases[rows].mean(0)) / pair.scale])
+    terms = places[rows]
+    weights = 1 / (1 + np.square(np.linalg.norm(away - np.median(away, 0), axis=1) / COSTS.usual))
+    inverse = np.linalg.inv((terms.T * weights) @ terms + prior * np.eye(4))
+    shifts = places @ (inverse @ (terms.T * weights) @ away)
+    variances = np.einsum("ni,ij,nj->n", places, inverse, places)
+    others = 1 - weights * variances[rows]  # > 0, as the prior counts, too
+    errors = (away - shifts[rows]) / others[:, None]
+    shifts[rows], variances[rows] = away - errors, variances[rows] / others
+    median = float(np.median(np.linalg.norm(errors[:, :2], axis=1))) / COSTS.usual
+    spread = (prior + len(rows) * median**2) / (prior + len(rows))
+    moved = shifts[:, None] * pair.scale
+    bent = replace(first, midribs=first.midribs + moved, points=first.points + moved)
+    return bent, np.sqrt(spread * (1 + variances))
 
 
 def costs_of(apart: Differences, scales: Scales) -> Floats:

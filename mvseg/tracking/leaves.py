@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from mvseg.tracking.dates import Floats, PlantOnDate, SeenLeaf
-from mvseg.tracking.numbers import COSTS, OBSERVATIONS
+from mvseg.tracking.numbers import ALIGN, COSTS, OBSERVATIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +64,6 @@ class DateLeaves:
             points=self.points @ rotation.T + shift,
         )
 
-    def shifted(self, shifts: Floats) -> DateLeaves:
-        """Each leaf by its own of the shifts (N, 3)."""
-        return replace(self, midribs=self.midribs + shifts[:, None], points=self.points + shifts[:, None])
-
 
 def leaves_of(date: PlantOnDate) -> DateLeaves:
     """The leaves of a date that have a shape."""
@@ -101,6 +97,7 @@ class Pair:
         knows_up: +z is up in both frames.
         scale: unit of places, see `Pair.of`.
         link_costs: (N, M) links of the user, as a cost: below 0 they are one, above 0 they are not.
+        still: prior log odds that the pot stands as it stood, over any single turn.
     """
 
     first: DateLeaves
@@ -109,10 +106,11 @@ class Pair:
     knows_up: bool
     scale: float
     link_costs: Floats
+    still: float
 
     @classmethod
     def of(
-        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, link_costs: Floats | None = None
+        cls, first: DateLeaves, second: DateLeaves, *, days: float, knows_up: bool, still: float = ALIGN.still
     ) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
@@ -121,8 +119,8 @@ class Pair:
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
                 sizes += [float(np.median(leaves.lengths)), COSTS.spread * float(np.sqrt(np.mean(spread**2)))]
-        costs = np.zeros((len(first), len(second))) if link_costs is None else link_costs
-        return cls(first, second, days, knows_up, scale=max(sizes), link_costs=costs)
+        no_links = np.zeros((len(first), len(second)))
+        return cls(first, second, days, knows_up, scale=max(sizes), link_costs=no_links, still=still)
 
     @property
     def fewer(self) -> int:
@@ -132,8 +130,3 @@ class Pair:
     def moved(self, pose: Floats) -> Pair:
         """The earlier date in the frame of the later one, by its pose (4, 4)."""
         return replace(self, first=self.first.moved(pose))
-
-    def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
-        """Some leaves of either date, with a scale of their own."""
-        first, second, costs = self.first.take(rows), self.second.take(columns), self.link_costs[np.ix_(rows, columns)]
-        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, link_costs=costs)

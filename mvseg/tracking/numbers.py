@@ -16,7 +16,6 @@ class ObservationNumbers:
 
     stations: int = 9  # definition: points of a midrib, base and tip included
     rows: int = 12  # definition: rows of points from base to tip, of edge, midrib and edge
-    most_parts: int = 256  # limit: max. parts of a path
     most_days: int = 100_000  # limit: days of five digits; more are dates, or seconds
 
     @property
@@ -29,9 +28,7 @@ class ObservationNumbers:
 class AlignNumbers:
     """The pose of a plant on one date in the world of another."""
 
-    still: float = 5 / 6  # chosen: probability that a pot stands as it stood, before its plant is known
-    prior_pairs: int = 6  # chosen: pairs of dates that say as much as this does
-    least_still: float = 1e-6  # limit: min. probability of either answer, so that its logarithm is a number
+    still: float = 4.0  # chosen: log odds that a pot stands as it stood, over any single turn, unless `pots` says more
     num_refined: int = 20  # chosen: poses of two dates that are refined, those that look best
     upright: float = 2.0  # chosen: weight of the direction of up where a pose is fitted, in leaves
     tip: float = 0.43  # chosen: weight of the tip of a leaf there, where base and middle have 1, for tips sway

@@ -104,10 +104,10 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         "gaps": [[row.date, row.track, row.state] for row in tracks.rows if row.leaf is None],
         "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in range(1, tracks.num_tracks + 1)},
         "warnings": list(map(str, tracks.findings)),
-    } | _describe_growth(tracks, growth)
+    } | _describe_growth(growth)
 
 
-def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
+def _describe_growth(growth: Growth) -> dict[str, Any]:
     """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}; and whole, of the plant, as track 0."""
     numbers: dict[str, dict[str, Any]] = {}
     for point in growth.points:

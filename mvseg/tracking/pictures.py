@@ -13,6 +13,7 @@ from PIL import Image, ImageOps
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import encode_jpeg, read_rgb
+from mvseg.results.overlay import find_thickest
 from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
 from mvseg.tracking.numbers import PAGE
@@ -47,7 +48,8 @@ def picture_leaves(result: Result, leaves: Collection[int], *, side: int = PAGE.
         for leaf in shown:
             mask = labels[view] == leaf
             jpeg = cut_picture(photo, mask, side=side)
-            pictures[leaf] = LeafPicture(jpeg, about.name, _inner_point(mask))
+            (column, row), _ = find_thickest(mask.astype(np.uint8))
+            pictures[leaf] = LeafPicture(jpeg, about.name, (column + 0.5, row + 0.5))
     return pictures
 
 
@@ -58,12 +60,6 @@ def picture_plant(result: Result) -> bytes:
     if not areas[view].any():
         return b""
     return cut_picture(_photo(result.scene.views[view].path, areas[view].shape), areas[view], side=PAGE.plant_side)
-
-
-def _inner_point(mask: np.ndarray) -> tuple[float, float]:
-    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
-    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
-    return float(column) + 0.5, float(row) + 0.5
 
 
 def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -14,38 +14,27 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
-from mvseg.tracking.align import (
-    Alignment,
-    Habit,
-    Poses,
-    best_pairs,
-    judge,
-    large_new,
-    near_world,
-    pose_distances,
-)
+from mvseg.tracking.align import Poses, align_at, guess_chance, pose_distances, pose_odds
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.fitted_costs import fitted_costs
-from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN
 
 PosesOfPairs = Mapping[tuple[int, int], Poses]
+Steps = Mapping[tuple[int, int], Floats]  # {(earlier, later): (4, 4) later_from_earlier}
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 
 
-def place_dates(num_dates: int, poses_of_pairs: PosesOfPairs, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
+def place_dates(num_dates: int, poses_of_pairs: PosesOfPairs) -> tuple[Floats, np.ndarray, Floats]:
     """The poses of T dates, from `poses_of_pairs` {(earlier, later): the poses of two dates that were looked at}.
 
     Returns:
         (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)
         the index of that date; and (T - 1,) the probability of each turn to the next date, see `weigh_turns`.
     """
-    if habit.still == 1:  # somebody says so
-        return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
-    alignments = {pair: judge(poses, habit) for pair, poses in poses_of_pairs.items()}
-    chained, roots = chain_dates(num_dates, alignments)
-    likeliness = _remembered(poses_of_pairs, habit)
-    poses = _search(chained, alignments, likeliness)
+    steps = {pair: poses.best.pose for pair, poses in poses_of_pairs.items()}
+    chances = {pair: guess_chance(poses.pair, poses.best) for pair, poses in poses_of_pairs.items()}
+    chained, roots = chain_dates(num_dates, steps, chances)
+    likeliness = _remembered(poses_of_pairs)
+    poses = _search(chained, steps, likeliness)
     poses = np.linalg.inv(poses[roots]) @ poses
     return poses, roots, weigh_turns(poses, poses_of_pairs, likeliness)
 
@@ -71,11 +60,11 @@ def weigh_turns(poses: Floats, poses_of_pairs: PosesOfPairs, likeliness: Likelin
     return chances
 
 
-def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment]) -> tuple[Floats, np.ndarray]:
-    """Poses and roots, see `place_dates`, by way of the likeliest alignments."""
+def chain_dates(num_dates: int, steps: Steps, chances: Mapping[tuple[int, int], float]) -> tuple[Floats, np.ndarray]:
+    """Poses and roots, see `place_dates`, by way of the likeliest steps."""
     weights, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
-    for pair, alignment in alignments.items():
-        weights[pair] = -1 - round(alignment.probability, ALIGN.digits)  # any falling order will do; 0 would be no way
+    for pair, chance in chances.items():
+        weights[pair] = -1 - round(chance, ALIGN.digits)  # any falling order will do; 0 would be no way
     tree = minimum_spanning_tree(weights)
     for root in range(num_dates):
         if roots[root] < 0:
@@ -83,33 +72,31 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
             poses[root], roots[order] = np.eye(4), root
             for date in order[1:].tolist():
                 earlier, later = sorted((date, int(before[date])))
-                step = alignments[earlier, later].pose
+                step = steps[earlier, later]
                 poses[date] = poses[before[date]] @ (step if date == earlier else np.linalg.inv(step))
     return poses, roots
 
 
-def _search(poses: Floats, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness) -> Floats:
-    """Move dates, each alone or with all later ones, to stand as their alignments say, if all then agree better."""
+def _search(poses: Floats, steps: Steps, likeliness: Likeliness) -> Floats:
+    """Move dates, each alone or with all later ones, to stand as a step to another says, if all then agree better."""
     for _ in range(ALIGN.date_rounds):
         before = poses
         for date in range(len(poses)):
             for moving in (slice(date, date + 1), slice(date, None)):
-                poses = _move(poses, moving, alignments, likeliness)
+                poses = _move(poses, moving, steps, likeliness)
         if poses is before:
             break
     return poses
 
 
-def _move(
-    poses: Floats, moving: slice, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
-) -> Floats:
+def _move(poses: Floats, moving: slice, steps: Steps, likeliness: Likeliness) -> Floats:
     is_moving = np.zeros(len(poses), bool)
     is_moving[moving] = True
     best, most = poses, 0.0
-    apart = [pair for pair in alignments if is_moving[pair[0]] != is_moving[pair[1]]]
+    apart = [pair for pair in steps if is_moving[pair[0]] != is_moving[pair[1]]]
     now = sum(likeliness(poses, pair) for pair in apart)
     for earlier, later in apart:
-        step = poses[later] @ alignments[earlier, later].pose @ np.linalg.inv(poses[earlier])
+        step = poses[later] @ steps[earlier, later] @ np.linalg.inv(poses[earlier])
         moved = poses.copy()
         moved[moving] = (step if is_moving[earlier] else np.linalg.inv(step)) @ moved[moving]
         gain = round(sum(likeliness(moved, pair) for pair in apart) - now, ALIGN.digits)
@@ -118,13 +105,13 @@ def _move(
     return best
 
 
-def _remembered(poses_of_pairs: PosesOfPairs, habit: Habit) -> Likeliness:
+def _remembered(poses_of_pairs: PosesOfPairs) -> Likeliness:
     """Log odds of the relative pose of two dates; computed once for the same step between the same dates."""
 
     @cache
     def of_step(pair: tuple[int, int], step: bytes) -> float:
-        of_pair, pose = poses_of_pairs[pair].pair, np.frombuffer(step).reshape(4, 4)
-        return ALIGN.temper * _gain(of_pair, pose) + habit.world_prior * float(near_world(of_pair, pose[None])[0])
+        of_pair = poses_of_pairs[pair].pair
+        return pose_odds(of_pair, align_at(of_pair, np.frombuffer(step).reshape(4, 4)))
 
     def likeliness(poses: Floats, pair: tuple[int, int]) -> float:
         return of_step(pair, step_between(poses, pair).tobytes())
@@ -135,12 +122,3 @@ def _remembered(poses_of_pairs: PosesOfPairs, habit: Habit) -> Likeliness:
 def step_between(poses: Floats, pair: tuple[int, int]) -> Floats:
     """(4, 4) later_from_earlier; by way of whichever dates its poses (T, 4, 4) were found, it has the same digits."""
     return np.round(np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], ALIGN.places)
-
-
-def _gain(pair: Pair, pose: Floats) -> float:
-    """Gain of a pose (4, 4) of two dates, minus the cost of large new leaves."""
-    if not pair.fewer:
-        return 0.0
-    costs = fitted_costs(pair.moved(pose))
-    pairs = best_pairs(costs)
-    return float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(pair, pairs)

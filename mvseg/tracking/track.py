@@ -93,8 +93,8 @@ def track_leaves(
         results: of two dates or more, in any order: result folders of `mvseg infer` or `mvseg batch`, `Result`s in
             memory, or `PlantOnDate`s.
         times: of each result: numbers (days) or ISO dates; None: 0, 1, 2, ...
-        pots: "fixed": they stand as they stood, and frames agree; "turned": any turn is as likely; "auto": how often
-            this plant's pot is turned is learned from its dates.
+        pots: "fixed": they stand as they stood, and frames agree; "turned": any turn is as likely as none; "auto":
+            standing is likelier than any single turn (`ALIGN.still`).
 
     Returns:
         The tracks. Of each two dates the likeliest alignment is taken, the probability of a link follows from its, and

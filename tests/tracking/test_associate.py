@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Alignment, make_poses
+from mvseg.tracking.align import make_poses
 from mvseg.tracking.associate import Association, join_observations, link_leaves
 from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.place_dates import chain_dates
@@ -100,10 +100,8 @@ def test_rivals_make_a_link_less_probable() -> None:
 
 
 def test_dates_stand_as_the_likeliest_alignments_say() -> None:
-    def moved(x: float, probability: float) -> Alignment:
-        return Alignment(make_poses(np.eye(3), np.array([x, 0, 0])), np.zeros((0, 2), int), probability=probability)
-
-    poses, roots = chain_dates(5, {(0, 1): moved(-1, 0.9), (1, 2): moved(-1, 0.9), (0, 2): moved(9, 0.8),
-                                   (2, 3): moved(5, 0.2)})  # fmt: skip
+    shifts = {(0, 1): -1.0, (1, 2): -1.0, (0, 2): 9.0, (2, 3): 5.0}
+    steps = {pair: make_poses(np.eye(3), np.array([x, 0, 0])) for pair, x in shifts.items()}
+    poses, roots = chain_dates(5, steps, {(0, 1): 0.9, (1, 2): 0.9, (0, 2): 0.8, (2, 3): 0.2})
     np.testing.assert_allclose(poses[:, 0, 3], [0, 1, 2, -3, 0])
     assert roots.tolist() == [0, 0, 0, 0, 4]

@@ -55,6 +55,15 @@ def test_one_leaf_that_breaks_the_symmetry_makes_them_sure() -> None:
     assert min(link.probability for link in sum_over_poses(links, compared)) > 0.8
 
 
+def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
+    """Even where the leaves say otherwise."""
+    leaves = [leaves_of(see(grow_blades(7, 3), day, turn=80 * day)[0]) for day in range(4)]
+    compared = compare_dates(leaves, [0.0, 1.0, 2.0, 3.0], knows_up=True, pots="fixed")
+    np.testing.assert_array_equal(compared.poses, np.tile(np.eye(4), (4, 1, 1)))
+    assert (compared.trust == 1).all()
+    assert compared.otherwise == {}
+
+
 def test_the_sum_is_that_of_a_loop() -> None:
     rng, links = (
         np.random.default_rng(0),

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mvseg.tracking.align import Alignment, best_pairs, refine_alignment
-from mvseg.tracking.bent_costs import bend, bent_costs
-from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, fitted_costs, size_costs
+from mvseg.tracking.align import best_pairs, refine_alignment
+from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, bend, bent_costs, fitted_costs, size_costs
 from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.numbers import COSTS, LINKING, OBSERVATIONS
 from tests.plants_over_days import Blades, grow_blades, see
@@ -47,7 +46,8 @@ def test_a_plant_that_leans_over_is_bent_before_its_leaves_are_compared() -> Non
     leaning = {leaf: blade + (blade[0, 1, 2], 0.4 * blade[0, 1, 2], 0) for leaf, blade in blades.items()}
     pair, there = pair_of(blades, leaning)
     alignment = refine_alignment(pair, np.eye(4))
-    bent, straight = bent_costs(pair, alignment), fitted_costs(pair.moved(alignment.pose), LINKS)
+    aligned = pair.moved(alignment.pose)
+    bent, straight = bent_costs(aligned, alignment.pairs), fitted_costs(aligned, LINKS)
     rows = np.arange(9)
     assert bent[rows, there].max() < straight[rows, there].max() - 2
     bent[rows, there] -= LINKING.unlinked
@@ -59,7 +59,7 @@ def test_each_leaf_is_bent_as_the_pairs_of_the_others_say() -> None:
     pair, there = pair_of(grow_blades(9, 3), {leaf: blade + 0.2 * blade[0, 1, 2] for leaf, blade in
                                               grow_blades(9, 3).items()})  # fmt: skip
     rows = np.arange(7)
-    bent, widths = bend(pair, Alignment(np.eye(4), np.stack([rows, there[:7]], 1)))
+    bent, widths = bend(pair, np.stack([rows, there[:7]], 1))
     bases, away = pair.first.bases / pair.scale, (pair.second.bases[there[:7]] - pair.first.bases[:7]) / pair.scale
     places = np.column_stack([np.ones(9), bases - bases[:7].mean(0)])
     weights = 1 / (1 + np.square(np.linalg.norm(away - np.median(away, 0), axis=1) / COSTS.usual))
@@ -82,14 +82,13 @@ def test_few_pairs_hardly_move_the_costs_and_many_that_agree_narrow_them() -> No
     pair, there = pair_of(grow_blades(14, 1), grow_blades(14, 1))
     widths = []
     for count in (0, 1, 3, 14):
-        bent, width = bend(pair, Alignment(np.eye(4), np.stack([np.arange(count), there[:count]], 1)))
+        bent, width = bend(pair, np.stack([np.arange(count), there[:count]], 1))
         np.testing.assert_allclose(bent.bases, pair.first.bases, atol=1e-9)
         widths.append(np.median(width))
     assert widths[0] == 1
     assert 0.7 < widths[2] < widths[1] < 1.2
     assert widths[3] < 0.6
-    nothing = Alignment(np.eye(4), np.zeros((0, 2), int))
-    np.testing.assert_array_equal(bent_costs(pair, nothing), fitted_costs(pair, LINKS))
+    np.testing.assert_array_equal(bent_costs(pair, np.zeros((0, 2), int)), fitted_costs(pair, LINKS))
 
 
 def test_a_leaf_of_which_half_is_seen_lies_on_the_whole_one() -> None:

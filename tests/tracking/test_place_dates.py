@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mvseg.tracking.align import Habit, Poses, judge, list_poses, make_poses
+from mvseg.tracking.align import Alignment, Poses, list_poses, make_poses
 from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.place_dates import place_dates
 from tests.plants_over_days import grow_blades, grown, see
@@ -33,7 +33,7 @@ def turns_of(poses: np.ndarray) -> np.ndarray:
 
 
 def test_all_dates_are_placed_and_sure_of_it() -> None:
-    poses, roots, steady = place_dates(4, look_at(TURNS), Habit(0.3))
+    poses, roots, steady = place_dates(4, look_at(TURNS))
     np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
     assert roots.tolist() == [0] * 4
     assert steady.min() > 0.9
@@ -44,24 +44,19 @@ def test_two_dates_that_look_alike_in_a_wrong_way_are_settled_by_the_others(wron
     looked = look_at(TURNS)
     there = looked[wrong]
     away = make_poses(Rotation.from_euler("z", 120, degrees=True).as_matrix(), np.array([5.0, 0, 0]))
-    best = judge(there, Habit(0.3))
-    likelier = Poses(
-        there.pair,
-        (*there.refined, type(best)(away, best.pairs, gain=best.gain + 30)),
-        np.append(there.gains, best.gain + 30),
-        np.append(there.near, 0.0),
-    )
-    assert np.allclose(judge(likelier, Habit(0.3)).pose, away)
-    poses, _, _ = place_dates(4, {**looked, wrong: likelier}, Habit(0.3))
+    other = Alignment(away, there.best.pairs, there.best.costs - 5)
+    likelier = Poses(there.pair, (*there.refined, other), np.append(there.odds, there.odds.max() + 10))
+    assert likelier.best is other
+    poses, _, _ = place_dates(4, {**looked, wrong: likelier})
     np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
 
 
 @pytest.mark.parametrize("date", range(4))
 def test_one_date_that_stands_wrong_to_all_others_is_moved_the_first_one_too(date: int) -> None:
-    looked, start = look_at(TURNS), place_dates(4, look_at(TURNS), Habit(0.3))[0]
+    looked, start = look_at(TURNS), place_dates(4, look_at(TURNS))[0]
     start[date] = start[date] @ make_poses(HALF_TURN, np.zeros(3))
     with patch("mvseg.tracking.place_dates.chain_dates", return_value=(start, np.zeros(4, int))):
-        poses, _, _ = place_dates(4, looked, Habit(0.3))
+        poses, _, _ = place_dates(4, looked)
     np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
     np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
 
@@ -72,12 +67,5 @@ def test_later_dates_that_stand_wrong_together_are_moved_together() -> None:
     steps = {(n, n + 1): list_poses(Pair.of(leaves[n], leaves[n + 1], days=1, knows_up=True)) for n in range(3)}
     start = np.stack([np.eye(4)] * 2 + [make_poses(HALF_TURN, np.zeros(3))] * 2)
     with patch("mvseg.tracking.place_dates.chain_dates", return_value=(start, np.zeros(4, int))):
-        poses, _, _ = place_dates(4, steps, Habit(0.3))
+        poses, _, _ = place_dates(4, steps)
     assert poses[:, 0, 0].min() > 0.99
-
-
-def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
-    """Even where the leaves say otherwise."""
-    poses, _, steady = place_dates(4, look_at(TURNS), Habit(1.0))
-    np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-9)
-    assert (steady == 1).all()
