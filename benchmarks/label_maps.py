@@ -23,7 +23,7 @@ from mvseg.evaluation.truth import true_instances
 from mvseg.formats.image_file import read_rgb
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, plant_index, scene_cameras
+from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, scene_cameras
 from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.ray_cast import build_bvh, build_stage, merge_meshes, render_stage
 from mvseg.simulation.scene_writer import drop_small, write_jpeg
@@ -158,3 +158,8 @@ def chosen_scenes(args: argparse.Namespace) -> list[SceneSpec]:
         if spec.split == args.split and spec.num_leaves in args.leaves and spec.num_views in args.views
         if plant_index(spec) < args.plants
     ]
+
+
+def plant_index(scene: SceneSpec) -> int:
+    """Index of the plant of a scene among those of its split and number of leaves."""
+    return int(scene.folder.split("-")[1].split("_")[0])

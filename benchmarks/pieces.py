@@ -22,7 +22,7 @@ from scipy.special import expit
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.faults import Faults, degrade_labels
-from benchmarks.label_maps import load_maps, visible_ids
+from benchmarks.label_maps import load_maps, plant_index, visible_ids
 from benchmarks.straps import cut_pieces, strap_cameras
 from mvseg.evaluation.truth import true_instances
 from mvseg.matching.affinity import region_affinity
@@ -31,7 +31,7 @@ from mvseg.matching.nview.pieces import PIECE, piece_features
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, list_specs, plant_index
+from mvseg.simulation.dataset import PRESETS, list_specs
 from mvseg.simulation.growth import grow_plant
 
 LEAVES, VIEWS, PLANTS, STRAPS = (8, 16, 32), (5, 10), 2, (8, 12)

@@ -48,7 +48,7 @@ NUM_LEAVES, NUM_VIEWS = 8, 10
 PHYLLOTAXIS = {
     "ovate": "decussate", "lanceolate": "spiral", "lobed": "spiral", "strap": "distichous", "leggy": "decussate"
 }  # fmt: skip
-NUMBERS = {"gain": 1, "width_change": -1, "aspect": 1, "relative_aspect": 1, "probability": 1}  # sign: of stems
+NUMBERS = {"gain": 1, "width_change": -1, "relative_aspect": 1, "probability": 1}  # sign: of stems
 HARD = ("strap", "fern", "lanceolate")
 
 

@@ -44,7 +44,7 @@ from benchmarks.checked_ids import choose_given
 from benchmarks.choice import true_maps
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
-from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
+from benchmarks.label_maps import KINDS, LabelledScene, load_maps, plant_index, visible_ids
 from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
@@ -66,7 +66,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, name_regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, plant_index
+from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -118,6 +119,16 @@ def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
         return function(*args, **kwargs)
 
     return checked
+
+
+def check_ranges(config: object, place: str = "", /, **ranges: tuple[float, float]) -> None:
+    """Refuse a number of a field of a config that is not finite or outside its range, ends included; `place` as in
+    `check_choices`. Raises InputError: names the field, the value, and the range."""
+    for name, (low, high) in ranges.items():
+        value = getattr(config, name)
+        if isinstance(value, int | float) and not (low <= value <= high and value != math.inf):
+            expected = f"at least {low}" if high == math.inf else f"a number from {low} to {high}"
+            raise InputError(f"{place}.{name} is {value}, expected {expected}".removeprefix("."))
 
 
 def check_choices(config: object, place: str = "") -> None:

@@ -126,10 +126,8 @@ class Regions:
 
     def at(self, view: int, x: int, y: int) -> list[int]:
         """The regions of a view that show the pixel in column x, row y, ascending; none outside of the image."""
-        x1, y1, x2, y2 = self.boxes.T
-        here = (self.view_index == view) & (x1 <= x) & (x < x2) & (y1 <= y) & (y < y2)
-        near = here.nonzero()[:, 0].tolist()
-        return [index for index in near if self.crop(index)[y - int(y1[index]), x - int(x1[index])]]
+        here = (self.view_index == view).nonzero()[:, 0].tolist()
+        return [index for index in here if self.placed(index).holds(x, y)]
 
     def union(self, indices: Iterable[int]) -> Crop:
         """Union of one or more regions of one view."""
@@ -239,31 +237,17 @@ class Regions:
         """Paint the regions of one view into one frame of `size` width, height, each with its value of (D,) int64; 0 or
         less: left out. Returns (height, width) int64, 0 elsewhere. The smaller of overlapping regions is on top."""
         frame = torch.zeros(size[1], size[0], dtype=torch.int64, device=self.device)
-        members = (self.view_index == view).nonzero()[:, 0]
-        members = members[self.areas[members].argsort(descending=True, stable=True)]
-        for index in members[values[members] > 0].tolist():
-            crop = self.placed(index)
-            crop.cut(frame)[crop.pixels] = values[index]
+        numbers = values.tolist()
+        for index in self.large_first(view):
+            if numbers[index] > 0:
+                crop = self.placed(index)
+                crop.cut(frame)[crop.pixels] = numbers[index]
         return frame
 
-
-def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
-    """x1, y1, x2, y2 (half-open) of a mask (h, w), which must have a pixel."""
-    x1, y1, x2, y2 = masks_to_boxes(mask[None])[0].tolist()
-    return x1, y1, x2, y2
-
-
-def masks_to_boxes(masks: Tensor) -> Tensor:
-    """(N, 4) int64 xyxy, half-open, of (N, H, W) masks; all 0 for a mask without pixels. torchvision's function of this
-    name gives boxes that end on the last pixel, and requires a pixel in every mask."""
-    ends = []
-    for axis in (1, 2):  # over the rows, for x; over the columns, for y
-        is_occupied = masks.bool().any(axis)
-        first = is_occupied.int().argmax(1)
-        last = is_occupied.shape[1] - is_occupied.flip(1).int().argmax(1)
-        ends.append((first, torch.where(is_occupied.any(1), last, 0)))
-    (x1, x2), (y1, y2) = ends
-    return torch.stack((x1, y1, x2, y2), 1)
+    def large_first(self, view: int) -> list[int]:
+        """The regions of a view by their areas: painted in this order, small ones lie on top."""
+        members = (self.view_index == view).nonzero()[:, 0]
+        return members[self.areas[members].argsort(descending=True, stable=True)].tolist()
 
 
 def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Regions:

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, NUM_COEFFICIENTS, Floats, patch_grid
+from mvseg.arrays import Floats
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, NUM_COEFFICIENTS, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 
 Sheet = Callable[[Floats, Floats], Floats]  # (along, across) in world units -> (..., 3) points

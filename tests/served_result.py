@@ -71,7 +71,7 @@ class Lesson:
             opened.learned = replace(plant, learned=Learned(weights=b"learned", rounds=1)), said
 
         monkeypatch.setattr(OpenResult, "learn", learn)
-        monkeypatch.setattr(OpenResult, "can_learn", True)
+        monkeypatch.setattr(OpenResult, "learner", property(lambda opened: opened))
 
 
 class SlowLook:

@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
-from mvseg.regions import mask_box, regions_from_label_maps, stack_regions
+from mvseg.regions import regions_from_label_maps, stack_regions
 
 
 def simulate_proposals(
@@ -38,7 +39,7 @@ def simulate_proposals(
             moved = _move_mask(mask, truth.boxes[index].numpy(), error=error, grow_px=int(rng.integers(-2, 3)))
             if not moved.any():
                 continue
-            x1, y1, x2, y2 = mask_box(torch.from_numpy(moved))
+            x1, y1, x2, y2 = Crop.of(moved).box
             view_index.append(view)
             boxes.append((x1, y1, x2, y2))
             crops.append(torch.from_numpy(moved[y1:y2, x1:x2].copy()).flatten())

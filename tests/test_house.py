@@ -34,7 +34,7 @@ PACKAGE = ROOT / "mvseg"
 # A room (a folder, or a module of the top level) imports only from the lines above its own, so rooms of one line never
 # import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
 FLOORS = (
-    ("findings", "_version"),
+    ("findings", "arrays", "_version"),
     ("errors",),
     ("system",),
     ("scene", "crop"),

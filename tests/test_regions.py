@@ -5,12 +5,12 @@ import weakref
 import numpy as np
 import pytest
 import torch
-import torchvision
 
 from mvseg import regions_from_masks
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.matching.samples import view_runs
-from mvseg.regions import IGNORE_LABEL, Regions, mask_box, masks_to_boxes, regions_from_label_maps
+from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps
 from reference import spread_pixels_reference, thinned_pixels_reference
 
 
@@ -72,7 +72,7 @@ def test_a_union_is_that_of_whole_frames() -> None:
     whole = regions.mask(0, 24, 24) | regions.mask(2, 24, 24)
     assert torch.equal(covered, whole[y1:y2, x1:x2])
     assert covered.sum() == whole.sum()
-    assert (x1, y1, x2, y2) == mask_box(whole)
+    assert (x1, y1, x2, y2) == Crop.of(whole).box
 
 
 def test_a_pixel_is_shown_by_the_masks_that_hold_it_in_whole_frames() -> None:
@@ -173,17 +173,6 @@ def test_inconsistent_regions_are_refused(change: dict, message: str) -> None:
     Regions(**fields)
     with pytest.raises(InputError, match=message):
         Regions(**(fields | change))
-
-
-def test_boxes_of_masks_are_torchvisions_but_half_open() -> None:
-    generator = torch.Generator().manual_seed(0)
-    masks = torch.rand(20, 9, 12, generator=generator) < 0.05
-    masks = masks[masks.flatten(1).any(1)]
-    boxes = masks_to_boxes(masks)
-    assert boxes.tolist() == (torchvision.ops.masks_to_boxes(masks).long() + torch.tensor([0, 0, 1, 1])).tolist()
-    assert mask_box(masks[3]) == tuple(boxes[3].tolist())
-    assert masks_to_boxes(torch.zeros(1, 4, 5)).tolist() == [[0, 0, 0, 0]]
-    assert masks_to_boxes(torch.zeros(0, 4, 5)).shape == (0, 4)
 
 
 def test_label_maps_are_not_kept() -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from benchmarks.label_maps import plant_index
 from benchmarks.paper_tables.cells import PRESETS, Cell, Record, keep_record, open_cell, read_cell, read_record
 from benchmarks.paper_tables.masks import Masks, degraded_masks, detected_masks, true_masks
 from benchmarks.paper_tables.methods import METHODS, score_method
@@ -16,7 +17,7 @@ from benchmarks.paper_tables.number_of_leaves import score_numbers
 from benchmarks.paper_tables.shapes import SHAPES, measure_shape
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.zoo import find_weights
-from mvseg.simulation.dataset import SceneSpec, plant_index
+from mvseg.simulation.dataset import SceneSpec
 
 TABLES = ("1", "2", "3", "k")
 

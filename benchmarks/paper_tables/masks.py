@@ -12,11 +12,12 @@ from torch import Tensor
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.found_leaves import tied_instances
 from benchmarks.paper_tables.cells import Cell
+from mvseg.crop import Crop
 from mvseg.detection.config import DetectConfig
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
-from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
+from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps, stack_regions
 
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
 
@@ -70,7 +71,7 @@ def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detecto
                 mask = soft > 0.5
                 if score < DetectConfig.min_score or int(mask.sum()) < MIN_PIXELS:
                     continue
-                x1, y1, x2, y2 = mask_box(mask)
+                x1, y1, x2, y2 = Crop.of(mask).box
                 view_index.append(view)
                 boxes.append((x1, y1, x2, y2))
                 crops.append(mask[y1:y2, x1:x2].flatten())

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.label_maps import plant_index
 from benchmarks.paper_tables import printed
 from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_record
 from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
 from benchmarks.paper_tables.methods import PRINTED
 from benchmarks.paper_tables.number_of_leaves import RULES
 from benchmarks.paper_tables.shapes import DEFAULT_SHARE, SHAPES, THRESHOLDS
-from mvseg.simulation.dataset import plant_index
 
 MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3)}
 HALVES = ("d", "excess", "gaps")

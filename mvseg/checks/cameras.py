@@ -9,13 +9,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.checks.numbers import CAMERAS
 from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
 from mvseg.verification.numbers import ROUGH
-
-Floats = NDArray[np.float64]
 
 DEPTHS = np.geomspace(0.02, 500, 80)  # depths of candidate points, in the median distance of two cameras
 GRID = (0.25, 0.5, 0.75)  # chosen: places of rays with candidate points, in the photo's width and height

@@ -11,11 +11,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.checks.numbers import AGREEMENT
 from mvseg.checks.poses import PoseAgreement, is_sure, view_agreement
 from mvseg.findings.finding import Finding, Level, list_findings
-
-Floats = NDArray[np.float64]
 
 
 def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:

@@ -13,7 +13,7 @@ from mvseg.errors import InputError
 from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
 from mvseg.formats.photo_content import PhotoContent, measure_content
-from mvseg.formats.photos import Photos, list_photos_in, photo_bits
+from mvseg.formats.photos import Photos, photo_bits, photos_in
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 
@@ -57,7 +57,7 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
     rules: list[Rule] = []
     if missing:
         first = scene.views[missing[0]].path
-        where: Values = {"path": str(first), "found": list_photos_in(first.parent)}
+        where: Values = {"path": str(first), "found": tuple(path.name for path in photos_in(first.parent))}
         if len(missing) < len(facts):
             rules.append(("missing_photos", "error", missing, where))
         else:

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.checks.masks import touches_border, without_small_components
 from mvseg.checks.numbers import AGREEMENT
 from mvseg.findings.finding import Finding, Level, Rule, list_findings
@@ -24,8 +25,6 @@ from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,15 +161,12 @@ def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
 
 def _hull_corners(regions: Regions) -> Tensor:
     """(D, P, 2) float64 corners of the regions' hulls, pixel centres; the first is repeated where there are fewer."""
-    hulls = [_hull(regions, index) for index in range(len(regions))]
+    whole = (cv2.findNonZero(without_small_components(regions.crop(index).numpy())) for index in range(len(regions)))
+    corners = zip(map(cv2.convexHull, whole), regions.boxes[:, None, :2].numpy(), strict=True)
+    hulls = [torch.from_numpy(hull[:, 0] + corner + 0.5) for hull, corner in corners]
     most = max((len(hull) for hull in hulls), default=1)
     padded = [torch.cat((hull, hull[:1].expand(most - len(hull), 2))) for hull in hulls]
     return torch.stack(padded) if hulls else torch.zeros(0, most, 2).double()
-
-
-def _hull(regions: Regions, index: int) -> Tensor:
-    corners = cv2.convexHull(cv2.findNonZero(without_small_components(regions.crop(index).numpy())))[:, 0]
-    return torch.from_numpy(corners + regions.boxes[index, :2].numpy() + 0.5)
 
 
 def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:

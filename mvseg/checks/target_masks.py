@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from mvseg.arrays import Floats
 from mvseg.checks.numbers import IMAGES
-
-Floats = NDArray[np.float64]
 
 LUMA = np.array([0.299, 0.587, 0.114])  # brightness as JPEG has it
 

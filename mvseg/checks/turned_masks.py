@@ -11,6 +11,7 @@ import torch
 
 from mvseg.checks.numbers import AGREEMENT
 from mvseg.checks.poses import PoseAgreement, is_sure, pairwise_agreement, view_agreement
+from mvseg.crop import Crop
 from mvseg.findings.finding import Finding
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
@@ -46,7 +47,7 @@ def low_fit_findings(
 def take_out_of_square(regions: Regions, cameras: Cameras) -> Regions:
     """The masks as they would be if they were drawn on photos that were padded to squares, with corners as shares of
     the squares (letterboxes of YOLO)."""
-    boxes, crops = [], []
+    crops = []
     for index in range(len(regions)):
         width, height = cameras.sizes[regions.view_index[index]].tolist()
         side = max(width, height)
@@ -55,13 +56,12 @@ def take_out_of_square(regions: Regions, cameras: Cameras) -> Regions:
         box = np.round(regions.boxes[index].numpy() * scale - shift).astype(int)
         size = max(int(box[2] - box[0]), 1), max(int(box[3] - box[1]), 1)
         crop = cv2.resize(regions.crop(index).numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-        x1, y1, x2, y2 = (int(each) for each in np.clip(box, 0, [width, height] * 2))
-        inside = crop[y1 - box[1] : y2 - box[1], x1 - box[0] : x2 - box[0]]
-        is_there = inside.size > 0
-        boxes.append((x1, y1, x1 + inside.shape[1], y1 + inside.shape[0]) if is_there else (0, 0, 1, 1))
-        crops.append(torch.from_numpy(inside > 0).flatten() if is_there else torch.zeros(1, dtype=torch.bool))
+        moved = Crop((*box.tolist()[:2], int(box[0]) + size[0], int(box[1]) + size[1]), torch.from_numpy(crop > 0))
+        inside = moved.within((0, 0, width, height))
+        crops.append(inside.tighten() if inside.pixels.any() else Crop((0, 0, 1, 1), inside.pixels[:1, :1]))
+    boxes, pixels = [each.box for each in crops], [each.pixels.flatten() for each in crops]
     labels, views = regions.labels.tolist(), regions.view_index.tolist()
-    return stack_regions(views, boxes, crops, labels=labels, num_views=regions.num_views)
+    return stack_regions(views, boxes, pixels, labels=labels, num_views=regions.num_views)
 
 
 def transpose(regions: Regions, _: Cameras) -> Regions:

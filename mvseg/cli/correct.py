@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import threading
 from contextlib import ExitStack, suppress
 from contextvars import copy_context
@@ -27,7 +28,6 @@ def run(args: Namespace) -> int:
     import webbrowser
 
     from mvseg.results.read import find_result
-    from mvseg.runs.recorded_run import repeat_command
     from mvseg.server.correction_server import Corrector
     from mvseg.server.local_server import CorrectionServer
     from mvseg.server.open_result import OpenResult, check_writable, open_alone
@@ -66,8 +66,8 @@ def run(args: Namespace) -> int:
             if opened.learner is not None and opened.learner.is_learned:
                 say("\nWhat the detector has learned is in the whole result, if the page made it since.")
             what, verb = ("tables and page", "track") if has_tracks else ("whole result", "infer")
-            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE, verb=verb)
-            say(f"\nThe {what} with these corrections: {command}")
+            again = ["--again", str(folder.resolve()), "--corrections", str(folder.resolve() / CORRECTIONS_FILE)]
+            say(f"\nThe {what} with these corrections: {shlex.join(['mvseg', verb, *again])}")
         finally:
             corrector.close()
             stack.close()  # the workers stop, whatever they are doing

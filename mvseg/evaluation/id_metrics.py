@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats.contingency import crosstab
 from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments
@@ -52,7 +53,7 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
     if instance_ids.shape != true_ids.shape or instance_ids.ndim != 1:
         shapes = f"{tuple(instance_ids.shape)} estimated ids with {tuple(true_ids.shape)} true ones"
         raise InputError(f"{shapes}, expected two vectors of equal length")
-    table = contingency_table(true_ids.cpu().numpy(), separate_unmatched(instance_ids.cpu().numpy()))
+    table = crosstab(true_ids.cpu().numpy(), separate_unmatched(instance_ids.cpu().numpy())).count
     both, true_pairs, estimated_pairs = (count_pairs(sizes) for sizes in (table, table.sum(1), table.sum(0)))
     count = len(true_ids)
     # Hubert and Arabie (1985): pairs in both, less those expected by chance, over the largest possible difference
@@ -69,14 +70,6 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
         num_estimated=table.shape[1],
         num_true=table.shape[0],
     )
-
-
-def contingency_table(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(J, K) int64: how many elements have the j-th smallest label of `first` (D,) and the k-th of `second` (D,)."""
-    rows, row = np.unique(first, return_inverse=True)
-    columns, column = np.unique(second, return_inverse=True)
-    counts = np.bincount(row * len(columns) + column, minlength=len(rows) * len(columns))
-    return counts.reshape(len(rows), len(columns))
 
 
 def share(part: float, whole: float) -> float:

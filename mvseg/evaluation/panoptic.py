@@ -12,10 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats.contingency import crosstab
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import contingency_table, count_pairs, share
+from mvseg.evaluation.id_metrics import count_pairs, share
 from mvseg.matching.partition import separate_unmatched
 from mvseg.regions import IGNORE_LABEL, Regions
 
@@ -190,6 +191,6 @@ def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray)
     ignored and find nothing aside); and pairs of true masks of one instance. `ids` (D,) int64 is the estimated instance
     of each mask, `leaf` (T,) int64 the true instance of each true mask."""
     is_right = masks.true_segment >= 0
-    together = contingency_table(leaf[masks.true_segment[is_right]], ids[is_right])
+    together = crosstab(leaf[masks.true_segment[is_right]], ids[is_right]).count
     estimated = np.bincount(ids[is_right | masks.is_false])
     return count_pairs(together), count_pairs(estimated), count_pairs(np.unique(leaf, return_counts=True)[1])

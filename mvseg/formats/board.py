@@ -7,11 +7,9 @@ from typing import Literal, get_args
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
-
-Floats = NDArray[np.float64]
 
 # Marker dictionaries, by OpenCV's names; the one with the most markers in the photos is used.
 Family = Literal["4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]

@@ -22,7 +22,6 @@ from mvseg.formats.find_views import PhotoSet, base_name, find_views
 from mvseg.formats.image_file import describe_turn
 from mvseg.formats.json_file import Int64, Items, check_content, load_json, read_json
 from mvseg.formats.masks.found_mask import check_categories
-from mvseg.formats.masks.other_json import refuse_other
 from mvseg.formats.run_lengths import Rle, decode_rle, shared_neighbours
 from mvseg.scene import Scene
 
@@ -125,9 +124,7 @@ def read_coco(
         if (crowd == "ignore" and annotation.iscrowd) or (categories and category not in categories):
             continue
         chosen[view].append((place, annotation))
-    if num_crowds:
-        code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
-        warn(Finding(code, str(path), {"count": num_crowds, "option": "--coco_crowd"}))
+    warn_of_crowds(path, num_crowds, crowd, option="--coco_crowd")
     if num_boxes:
         if any(annotation.segments_info for annotation in coco.annotations):
             mend = "the folder of its PNGs, in which each colour is a mask, or an instances JSON"
@@ -144,6 +141,13 @@ def read_coco(
     return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
 
 
+def warn_of_crowds(path: Path, count: int, crowd: Crowd, *, option: str) -> None:
+    """Warn (InputWarning) of annotations with `iscrowd`, if there are any; `option` says what they are."""
+    if count:
+        code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
+        warn(Finding(code, str(path), {"count": count, "option": option}))
+
+
 def read_files(parts: Sequence[Path], scene: PhotoSet) -> CocoMasks:
     """The content of a COCO file, or of the parts of one, in any dialect; see `read_coco`."""
     files = [(part, _read_file(part, scene)) for part in parts]
@@ -154,11 +158,7 @@ def _read_file(path: Path, scene: PhotoSet) -> CocoMasks:
     """The file; a list of results gets the images that it refers to."""
     content = load_json(path)
     if not isinstance(content, list):
-        try:
-            return check_content(path, content, CocoMasks)
-        except InputError:
-            refuse_other(path, path.read_bytes())
-            raise
+        return check_content(path, content, CocoMasks, expected="COCO")
     results = check_content(path, content, _Results, expected="COCO").root
     listed = _find_data_set(path, results)
     if listed is None:
@@ -321,7 +321,8 @@ def check_segmentations(segmentations: Iterable[tuple[Any, Sequence[int]]]) -> N
             with suppress(TypeError, ValueError):  # of another form, which the decoder names
                 counts = np.array(segmentation["counts"], np.int64)
                 down, across = np.add((down, across), shared_neighbours(counts, width, height))
-    if polygons and all(isinstance(part, list) and all(map(_is_share, part)) for part, _, _ in polygons):
+    numbers = [x for part, _, _ in polygons for x in (part if isinstance(part, list) else [None])]
+    if polygons and all(isinstance(x, (int, float)) and 0 <= x <= 1 for x in numbers):
         raise InputError("all corners lie between 0 and 1: are they shares of the photo's size? expected pixels")
     if across > 2 * down:
         raise InputError("its run lengths go along the rows, expected down the columns: of mask.T, or by pycocotools")
@@ -339,10 +340,6 @@ def _relative(part: Any, width: int, height: int) -> np.ndarray:
     is_polygon = isinstance(part, list) and len(part) % 2 == 0
     is_polygon = is_polygon and all(isinstance(x, (int, float)) and abs(x) < 1 << 50 for x in part)
     return np.array(part if is_polygon else [], float).reshape(-1, 2) / (width, height)
-
-
-def _is_share(number: Any) -> bool:
-    return isinstance(number, (int, float)) and 0 <= number <= 1
 
 
 def _decode_polygons(polygons: list[list[float]], width: int, height: int) -> np.ndarray:

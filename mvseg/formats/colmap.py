@@ -13,8 +13,7 @@ import pycolmap
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding, Values
 from mvseg.formats.find_views import natural_order
-from mvseg.formats.image_file import PHOTO_SUFFIXES
-from mvseg.formats.photos import Photo, build_scene
+from mvseg.formats.photos import Photo, build_scene, photos_in
 from mvseg.scene import Scene
 
 
@@ -74,8 +73,8 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     photos = [_photo(model, image, reconstruction.cameras[image.camera_id]) for image in images if image.has_pose]
     scene = build_scene(folder, photos, unit="", source=model)
     registered, images_folder = {view.path for view in scene.views}, folder / "images"
-    files = [path for path in sorted(images_folder.rglob("*.*")) if path.name.lower().endswith(PHOTO_SUFFIXES)]
-    left_out = [path.relative_to(images_folder).as_posix() for path in files if path not in registered]
+    photos_there = photos_in(images_folder, "**/*")
+    left_out = [path.relative_to(images_folder).as_posix() for path in photos_there if path not in registered]
     if left_out:
         warn(Finding("photos_without_pose", str(model), {"count": len(left_out), "first": left_out[0]}))
     return scene

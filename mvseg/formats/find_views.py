@@ -6,27 +6,28 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.image_file import PHOTO_SUFFIXES
-from mvseg.scene import View
+from mvseg.scene import Scene, View
 
 # Roboflow calls the export of 000.jpg "000_jpg.rf.<hash>.jpg".
 ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECASE)
 LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-", re.IGNORECASE)  # its upload of 000.jpg is "5f1c0e7a-000.jpg"
 
 
-class PhotoSet(Protocol):
-    """A `Scene`, or photos without cameras."""
+@dataclass(frozen=True)
+class LonePhotos:
+    """Photos without cameras, named as the views of a scene are."""
 
-    @property
-    def views(self) -> tuple[View, ...]: ...
+    views: tuple[View, ...]
+    source: Path | None = None
 
-    @property
-    def source(self) -> Path | None: ...
+
+PhotoSet = Scene | LonePhotos
 
 
 def find_views(

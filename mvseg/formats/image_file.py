@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import math
 import os
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from threading import Lock
 from typing import IO, Any
 
 import cv2
@@ -42,7 +39,6 @@ ORIENTATION = 0x0112  # definition: EXIF tag, and TIFF's
 BACK = {6: 8, 8: 6}  # the orientation that undoes another; the others undo themselves
 EXPOSURE_BLOCK, SECONDS, APERTURE, ISO = 0x8769, 0x829A, 0x829D, 0x8827  # definition: EXIF tags
 BITS_PER_SAMPLE = 0x0102  # definition: TIFF tag
-LARGE = 1 << 26  # limit: pixels; Pillow's own limit lies above
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
 # These formats only: among Pillow's others is one (EPS) that runs a program.
@@ -54,7 +50,6 @@ READERS: tuple[tuple[bytes, type[ImageFile]], ...] = (
     (b"BM", BmpImageFile),
     (b"RIFF", WebPImageFile),
 )
-_pillow_limit = Lock()
 
 
 class WrongSize(InputError):
@@ -81,16 +76,23 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         if path.stat().st_size > most:
             raise InputError(f"it is a file of {path.stat().st_size} bytes, expected at most {most}")
         data = path.read_bytes()
-        if reader is PngImageFile and not _has_sound_chunks(data):
-            raise InputError("it is cut short, or a checksum is wrong")
+        if reader is PngImageFile:
+            _verify(data)
         image = _open(reader, data)
         if size is not None and sorted(image.size) != sorted(size):  # a TIFF may be turned when it is decoded
             raise WrongSize(image.width, image.height)
         if image.width * image.height > MAX_PIXELS:
             raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
         turn = _orientation_of(image) if _is_turned_by_decoder(image) else 1
-        _load(image)
+        image.load()
         return _turn_back(image, turn) if turn > 1 else image
+
+
+def _verify(data: bytes) -> None:
+    try:
+        PngImageFile(BytesIO(data)).verify()  # the checksums of all chunks, up to the last one
+    except (OSError, SyntaxError):
+        raise InputError("it is cut short, or a checksum is wrong") from None
 
 
 def _open(reader: Any, data: bytes) -> ImageFile:
@@ -298,33 +300,6 @@ def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | N
     if path == "." or "\0" in path:
         return "this is not the name of a file"
     return None
-
-
-def _load(image: ImageFile) -> None:
-    """Decode the pixels; only for a large file, our limit replaces Pillow's, one number for the whole process."""
-    if image.width * image.height < LARGE:
-        image.load()
-        return
-    with _pillow_limit:
-        limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-        try:
-            image.load()
-        finally:
-            Image.MAX_IMAGE_PIXELS = limit
-
-
-def _has_sound_chunks(data: bytes) -> bool:
-    """Whether a PNG file is complete up to its end chunk, each chunk with the right checksum."""
-    at, kind = len(PNG_START), b""
-    while kind != b"IEND":
-        if at + 12 > len(data):
-            return False
-        length, kind = struct.unpack_from(">I4s", data, at)
-        stop = at + 8 + length
-        if zlib.crc32(data[at + 4 : stop]).to_bytes(4, "big") != data[stop : stop + 4]:
-            return False
-        at = stop + 4
-    return True
 
 
 def write_png(path: Path, image: np.ndarray) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-Floats = NDArray[np.float64]
+from mvseg.arrays import Floats
 
 ALONG = np.linspace(-0.3, 0.3, 5)  # where an edge between two modules is looked at, in modules from its middle
 PASSES = 3  # limit: OpenCV's quads are right to a pixel or two; the third pass moves corners by 0.002 pixels

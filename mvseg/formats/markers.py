@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.formats.board import FAMILIES, BoardConfig, Family, marker_dictionary
 from mvseg.formats.marker_edges import fit_grid
 from mvseg.formats.photos import Photos
 from mvseg.system.running import progress_bar
 
-Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
 Corner = tuple[int, int]  # a marker and its corner, 0 to 3, clockwise from its top left
 Seen = dict[Corner, list[tuple[int, Floats]]]  # {corner: (view, (2,) pixels) wherever it is seen}

@@ -109,10 +109,10 @@ def find_photo(folder: Path, file: str) -> str:
         if (folder / file).is_file():
             return file
         parent = (folder / file).parent
-        matches = [path for path in _list_photos(parent, "*") if _is_named(path, name)]
+        matches = [path for path in photos_in(parent) if _is_named(path, name)]
         if len(matches) == 1:
             return matches[0].relative_to(folder).as_posix()
-    photos = [*_list_photos(folder, "*"), *_list_photos(folder / "images", "**/*")]
+    photos = [*photos_in(folder), *photos_in(folder / "images", "**/*")]
     matches = [path for path in photos if _is_named(path, name)]
     return matches[0].relative_to(folder).as_posix() if len(matches) == 1 else file
 
@@ -127,11 +127,14 @@ def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
         return read_image_size(photo)
 
 
-def _list_photos(folder: Path, pattern: str) -> list[Path]:
+def photos_in(folder: Path, pattern: str = "*") -> list[Path]:
+    """The photos of a folder that fit a pattern, by their paths; hidden files are none. [] where there is no folder, or
+    it cannot be read."""
     try:
-        return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file())
+        files = sorted(path for path in folder.glob(pattern) if path.is_file())
     except (OSError, ValueError):  # not readable, or a name that no file system takes
         return []
+    return [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")]
 
 
 def _is_named(path: Path, name: str) -> bool:
@@ -172,8 +175,8 @@ def check_photos(scene: Scene) -> None:
         if any(present):
             beside = describe_folder(paths[missing].parent)
             raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside}")
-        if found := list_photos_in(paths[missing].parent):
-            warn(Finding("all_photos_missing", str(paths[0]), {"found": found}))
+        if found := photos_in(paths[missing].parent):
+            warn(Finding("all_photos_missing", str(paths[0]), {"found": tuple(path.name for path in found)}))
         return
     warn_of_turned(paths)
     known = _bits_of_views(scene)
@@ -189,18 +192,9 @@ def warn_of_turned(paths: Sequence[Path]) -> None:
         warn(Finding("turned_for_display", str(turned[0]), {"count": len(turned)}))
 
 
-def list_photos_in(folder: Path) -> tuple[str, ...]:
-    """Names of the photos in a folder; () where there is none, or no folder."""
-    try:
-        names = sorted(path.name for path in folder.iterdir() if path.is_file())
-    except OSError:
-        return ()
-    return tuple(name for name in names if name.lower().endswith(PHOTO_SUFFIXES))
-
-
 def describe_folder(folder: Path) -> str:
     """The photos in the folder where one is missing, as the end of a sentence; "" if there are none."""
-    found = list_photos_in(folder)
+    found = [path.name for path in photos_in(folder)]
     return f"; found {list_some(found)}" if found else ""
 
 

@@ -11,13 +11,11 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
 from mvseg.formats.board import Family
 from mvseg.system.atomic import write_whole
-
-Floats = NDArray[np.float64]
 
 WIDTH, HEIGHT = 210.0, 297.0  # definition: of an A4 page, mm
 FAMILY: Family = "APRILTAG_36H11"

@@ -17,7 +17,7 @@ from mvseg.errors import InputError
 from mvseg.system.atomic import write_text_whole
 
 MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26  # limit: bytes of a file, and of a table
-MAX_DEPTH, MAX_DIGITS = 32, 400  # limit: of YAML: PyYAML recurses as deep as Python's stack
+ALIAS = yaml.AliasEvent
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 Cell = str | float | None
@@ -93,6 +93,11 @@ def format_number(value: float) -> str:
     return f"{value:.6g}" if np.isfinite(value) else ""
 
 
+def short_number(value: float) -> float | None:
+    """The number that `format_number` writes, for JSON; None for what is not finite."""
+    return float(format_number(value)) if np.isfinite(value) else None
+
+
 def escape_text(text: str) -> str:
     """Text in one line that no spreadsheet takes for a formula; numbers stay numbers, also negative ones."""
     text = " ".join(text.split())
@@ -101,30 +106,12 @@ def escape_text(text: str) -> str:
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
     """Content of a YAML file; a line of OpenCV, "%YAML:1.0", is left out. Raises InputError as `read_text`, or if it is
-    not YAML, is nested more than 32 deep, uses aliases (nested ones expand 300 bytes into billions of values), or holds
-    a number of more than 400 digits."""
+    not YAML that Python can hold, or uses aliases (nested ones expand 300 bytes into billions of values)."""
     lines = read_text(path, expected).split("\n")
     text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
     try:
-        _check_events(path, text)
+        if alias := next((each for each in yaml.parse(text, Loader=yaml.SafeLoader) if isinstance(each, ALIAS)), None):
+            raise ValueError(f"line {alias.start_mark.line + 1} has the alias *{alias.anchor}, expected plain values")
         return yaml.load(text, loader)
-    except InputError:
-        raise
     except Exception as error:  # yaml raises its own kinds, and those of its builders
         raise InputError(f"{path}: is not a YAML file ({' '.join(str(error).split())}), expected {expected}") from None
-
-
-def _check_events(path: Path, text: str) -> None:
-    depth = 0
-    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # event by event: nothing is built
-        line = event.start_mark.line + 1
-        if isinstance(event, yaml.AliasEvent):
-            raise InputError(f"{path}: line {line} has the alias *{event.anchor}, expected plain values")
-        if isinstance(event, yaml.CollectionStartEvent):
-            depth += 1
-            if depth > MAX_DEPTH:
-                raise InputError(f"{path}: line {line} is nested more than {MAX_DEPTH} deep, expected plain values")
-        elif isinstance(event, yaml.CollectionEndEvent):
-            depth -= 1
-        elif isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_DIGITS and event.value[1:].isdigit():
-            raise InputError(f"{path}: line {line} holds a number of {len(event.value)} digits")

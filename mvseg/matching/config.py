@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError, check_choices
+from mvseg.errors import InputError, check_choices, check_ranges
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,14 @@ class MatchConfig:
 
     def __post_init__(self) -> None:
         check_choices(self, "match")
-        for name in ("num_points", "num_instances", "num_restarts"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"match.{name} is {value}, expected at least 1")
+        at_least_1 = (1, math.inf)
+        check_ranges(self, "match", num_points=at_least_1, num_instances=at_least_1, num_restarts=at_least_1)
+        check_ranges(self, "match", seed=(0, 2**32 - 1))
         if self.method in ("nview", "one-per-view") and (self.num_instances or self.search_range):
             raise InputError(f"match.num_instances and match.search_range are for symnmf, not for {self.method}")
         if self.search_range is not None and not 1 <= self.search_range[0] <= self.search_range[1]:
             low, high = self.search_range
             raise InputError(f"match.search_range is [{low}, {high}], expected 1 <= smallest <= largest")
-        if not 0 <= self.seed < 2**32:
-            raise InputError(f"match.seed is {self.seed}, expected a number from 0 to 2^32 - 1")
 
     @property
     def resolved_method(self) -> Literal["nview", "one-per-view", "symnmf"]:

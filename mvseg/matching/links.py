@@ -10,15 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from mvseg.arrays import Ints
 from mvseg.errors import InputError
 from mvseg.matching.partition import Clusters
-
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

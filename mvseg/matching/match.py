@@ -135,16 +135,12 @@ def _factorise(regions: Regions, graph: ViewGraph, _: Clusters | None, *, config
 
 
 def matching_of_ids(instance_ids: Tensor, regions: Regions, graph: Affinity, *, method: str) -> Matching:
-    """The matching for ids in [1, K] or -1 from a graph; the scores are mean weights within clusters."""
-    masks = Masks.of(regions, instance_ids, mean_affinity(graph, instance_ids, regions))
-    return Matching(masks, MatchReport(method=method))
-
-
-def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) -> Tensor:
-    """(D,) float32: mean affinity of each region to the members of its cluster in other views; 0 where it has none."""
+    """The matching for ids in [1, K] or -1 from a graph; the score of a region is its mean affinity to the members of
+    its cluster in other views, 0 where it has none."""
     is_same = (instance_ids[:, None] == instance_ids) & (instance_ids > 0)
     is_partner = is_same & (regions.view_index[:, None] != regions.view_index)
-    return (affinity.to_dense() * is_partner).sum(1) / is_partner.sum(1).clamp(min=1)
+    scores = (graph.to_dense() * is_partner).sum(1) / is_partner.sum(1).clamp(min=1)
+    return Matching(Masks.of(regions, instance_ids, scores), MatchReport(method=method))
 
 
 def check_views(regions: Regions, cameras: Cameras) -> None:

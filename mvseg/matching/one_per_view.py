@@ -8,17 +8,14 @@ power iteration, Chen and Candes 2016, with the Hungarian method as the projecti
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import squareform
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import ONE_PER_VIEW
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
-
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 
 def one_per_view_clusters(graph: ViewGraph) -> Clusters:
@@ -99,7 +96,7 @@ def join_alone(graph: ViewGraph, clusters: Clusters, *, stop: float) -> Clusters
     return Clusters.of(ids)
 
 
-def assign_one_to_one(gain: Floats, alone: float | Floats) -> Ints:
+def assign_one_to_one(gain: Reals, alone: float | Reals) -> Ints:
     """Assign N regions to K clusters by `gain` (N, K), -inf for never: a cluster takes at most one, and any region may
     stay alone for a gain of `alone`, one for all or (N,). Returns (N,) clusters; regions alone get K, K + 1, ..."""
     num_regions, num_clusters = gain.shape

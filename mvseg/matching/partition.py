@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-Ints = NDArray[np.int64]
+from mvseg.arrays import Ints
 
 
 @dataclass(frozen=True, eq=False)

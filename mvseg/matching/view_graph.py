@@ -10,14 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.arrays import Bools, Ints, Reals
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.links import NO_LINKS, Links
 from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
-
-Bools = NDArray[np.bool_]
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +27,7 @@ class ViewGraph:
         links: regions that must stay together or apart.
     """
 
-    weights: Floats
+    weights: Reals
     view_index: Ints
     num_views: int
     links: Links = NO_LINKS
@@ -53,7 +50,7 @@ class ViewGraph:
         """The same graph, nothing known of its regions."""
         return replace(self, links=NO_LINKS) if len(self.links) else self
 
-    def sum_partners(self, values: Floats, clusters: Clusters) -> NDArray[np.float64]:
+    def sum_partners(self, values: Reals, clusters: Clusters) -> NDArray[np.float64]:
         """(D,) sums of `values` (D, D) between each region and its partners: its cluster's members in other views."""
         sums = np.zeros(len(clusters.ids))
         for members in clusters.members:
@@ -85,7 +82,7 @@ class ViewGraph:
         """(D,) whether a link of the user names the region."""
         return self.is_joined | self.apart.any(1)
 
-    def contract(self) -> Floats:
+    def contract(self) -> Reals:
         """(N, N) symmetric, >= 0: the weights between nodes, so that SymNMF of them is that of all regions with links.
 
         With equal rows of H for the regions of one node, H = Q G. Q, 1 / sqrt(size) where a region is in a node, is
@@ -95,7 +92,7 @@ class ViewGraph:
             return self.weights
         Q = np.eye(int(self.node.max()) + 1)[self.node]
         Q = Q / np.sqrt(Q.sum(0))
-        weights: Floats = Q.T @ np.where(self.apart, 0, self.weights) @ Q
+        weights: Reals = Q.T @ np.where(self.apart, 0, self.weights) @ Q
         return weights
 
     def part(self, clusters: Clusters) -> Clusters:
@@ -150,7 +147,7 @@ class Movers:
         """(N,) regions of each."""
         return np.bincount(self.owner, minlength=self.num)
 
-    def total(self, values: Floats) -> Floats:
+    def total(self, values: Reals) -> Reals:
         """(N, K) sums over the regions of each node; `values` (R, K)."""
         summed = np.zeros((self.num, values.shape[1]), values.dtype)
         np.add.at(summed, self.owner, values)

@@ -14,10 +14,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
 from mvseg.poses.numbers import WORLD
-
-Floats = NDArray[np.float64]
 
 MIRROR = np.array([1.0, 1.0, -1.0])
 

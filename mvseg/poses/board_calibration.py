@@ -15,11 +15,12 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.markers import Grey, find_board
 from mvseg.poses.numbers import TABLE
-from mvseg.poses.table_fit import Floats, Sightings, TableCamera, TableFit, fit_table, opencv_matrix
+from mvseg.poses.table_fit import Sightings, TableCamera, TableFit, fit_table, opencv_matrix
 
 Seen = dict[int, tuple[np.ndarray, Floats]]  # {place of the angle: numbers and pixels of the corners}
 Poses = dict[int, pycolmap.Rigid3d]  # {place of the angle: cam_from_board}
@@ -193,7 +194,10 @@ def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict
     if upwards @ direction < 0:
         direction, turns = -direction, -turns
     point = point + ((cam_from_board * middle - point) @ direction) * direction
-    cam_from_world = _rigid(_axes_about(direction), point)
+    side = np.cross(direction, [1.0, 0, 0] if abs(direction[0]) < 0.9 else [0, 1.0, 0])
+    side /= np.linalg.norm(side)
+    axes = np.column_stack([side, np.cross(direction, side), direction])
+    cam_from_world = _rigid(Rotation.from_matrix(axes), point)
     angles = dict(zip(poses, turns.tolist(), strict=True))
     return cam_from_world, angles, cam_from_world.inverse() * cam_from_board
 
@@ -208,12 +212,6 @@ def _find_axis(poses: Sequence[pycolmap.Rigid3d]) -> tuple[Floats, Floats, Float
     rows = np.concatenate([*(motion.rotation.matrix() - np.eye(3) for motion in motions), direction[None]])
     shifts = np.concatenate([*(-motion.translation for motion in motions), np.zeros(1)])
     return direction, np.linalg.lstsq(rows, shifts, rcond=None)[0], angles
-
-
-def _axes_about(direction: Floats) -> Rotation:
-    side = np.cross(direction, [1.0, 0, 0] if abs(direction[0]) < 0.9 else [0, 1.0, 0])
-    side /= np.linalg.norm(side)
-    return Rotation.from_matrix(np.column_stack([side, np.cross(direction, side), direction]))
 
 
 def _turn_z(angle_deg: float) -> pycolmap.Rigid3d:

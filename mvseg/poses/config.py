@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_ranges
 from mvseg.formats.board import BoardConfig
 from mvseg.poses.numbers import STRUCTURE
 
@@ -44,12 +44,8 @@ class PoseConfig:
     frames: int = 60
 
     def __post_init__(self) -> None:
-        if self.image_size < 64:
-            raise InputError(f"image_size is {self.image_size}, expected 64 or more")
-        if self.min_registered is not None and self.min_registered < STRUCTURE.least:
-            raise InputError(f"min_registered is {self.min_registered}, expected {STRUCTURE.least} or more")
-        if self.frames < STRUCTURE.least:
-            raise InputError(f"frames is {self.frames}, expected {STRUCTURE.least} or more")
+        least = (STRUCTURE.least, math.inf)
+        check_ranges(self, image_size=(64, math.inf), min_registered=least, frames=least)
         if self.calibration is not None and self.shared_camera is False:
             raise InputError("shared_camera is false beside a calibration, expected one of them")
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.board import BoardConfig
@@ -25,8 +25,6 @@ from mvseg.poses.numbers import WORLD
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
-
-Floats = NDArray[np.float64]
 
 MARKER = "marker:"  # in front of a marker's number, where a photo's name could stand
 PLACE = re.compile(r"(.+?):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)(\+|$)")  # photo:x,y+
@@ -222,8 +220,9 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     ratios = [np.linalg.norm(target[i] - target[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
     if not ratios:
         raise InputError(f"{path}: all positions are at one place, expected where the camera stood")
-    known, found = (_places_on_a_line(points) for points in (target, centers))
-    misfit = np.sqrt(max(0.0, 1 - np.corrcoef(known, found)[0, 1] ** 2))
+    away = [points - points.mean(0) for points in (target, centers)]
+    places = [each @ np.linalg.svd(each, full_matrices=False)[2][0] for each in away]
+    misfit = np.sqrt(max(0.0, 1 - np.corrcoef(*places)[0, 1] ** 2))
     if misfit > WORLD.misfit:
         warn(Finding("positions_misfit", str(path), {"share": float(misfit)}))
     warn(Finding("positions_on_a_line", str(path)))
@@ -232,9 +231,3 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
         unit=unit,
         source=f"{len(target)} positions on one line of {path.name}",
     )
-
-
-def _places_on_a_line(points: Floats) -> Floats:
-    """(P,) places of points along the axis on which they are spread most."""
-    away = points - points.mean(0)
-    return np.asarray(away @ np.linalg.svd(away, full_matrices=False)[2][0])

@@ -58,7 +58,7 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
         two = _try(model, _two_focal_lengths)
         middle = _try(model, _same, is_middle_free=True)
         own_middle = _try(model, _same, is_own=True, is_middle_free=True)
-        fisheye = _try(model, _fisheye)
+        fisheye = _try(model, lambda camera: ("SIMPLE_RADIAL_FISHEYE", _same(camera)[1]))
         aspect, deviation = _aspect(two)
     lengths, spread = _focal_lengths_of_photos(own.model, model)
     is_square_known = deviation < LENS.most_aspect_sd
@@ -87,10 +87,6 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
 
 def _same(camera: pycolmap.Camera) -> tuple[str, list[float]]:
     return camera.model_name, list(map(float, camera.params))
-
-
-def _fisheye(camera: pycolmap.Camera) -> tuple[str, list[float]]:
-    return "SIMPLE_RADIAL_FISHEYE", _same(camera)[1]
 
 
 def _two_focal_lengths(camera: pycolmap.Camera) -> tuple[str, list[float]]:

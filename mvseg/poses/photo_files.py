@@ -17,7 +17,6 @@ from mvseg.formats.find_views import natural_order
 from mvseg.formats.heic import SUFFIXES as HEIC_SUFFIXES
 from mvseg.formats.image_file import (
     ORIENTATION,
-    PHOTO_SUFFIXES,
     read_image,
     read_orientation,
     read_rgb,
@@ -26,6 +25,7 @@ from mvseg.formats.image_file import (
     write_png,
 )
 from mvseg.formats.opencv_yaml import Calibration
+from mvseg.formats.photos import photos_in
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.system.running import progress_bar
 
@@ -80,13 +80,13 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "no such folder"
         raise InputError(f"{folder}: {problem}, expected a folder of photos or a video (MP4, MOV, 3GP, AVI, MKV, WebM)")
-    files = _files_in(folder)
-    if not _are_photos(files) and _are_photos(_files_in(folder / "images")):
-        folder, files = folder / "images", _files_in(folder / "images")
-    if not _are_photos(files):
+    paths = photos_in(folder)
+    if not paths and (paths := photos_in(folder / "images")):
+        folder = folder / "images"
+    if not paths:
         folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
-        files += [path for each in folders for path in _files_in(each)]
-    photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+        paths = [path for each in folders for path in photos_in(each)]
+    photos = [path.relative_to(folder).as_posix() for path in paths]
     if len(photos) < STRUCTURE.least:
         kinds = "JPEG, PNG, TIFF, BMP, WebP, HEIC"
         raise InputError(f"{folder}: found {len(photos)} photos ({kinds}), expected at least three")
@@ -96,15 +96,6 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
         if other != name:
             raise InputError(f"{folder}: {other} and {name} differ in their suffix only, expected one of them")
     return folder, sorted(photos, key=natural_order)
-
-
-def _files_in(folder: Path) -> list[Path]:
-    paths = sorted(folder.iterdir()) if folder.is_dir() else []
-    return [path for path in paths if path.is_file() and not path.name.startswith(".")]
-
-
-def _are_photos(files: Sequence[Path]) -> bool:
-    return any(path.suffix.lower() in PHOTO_SUFFIXES for path in files)
 
 
 def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoFile]:

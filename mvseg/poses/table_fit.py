@@ -18,14 +18,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from mvseg.arrays import Floats, Ints
 from mvseg.poses.numbers import TABLE
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # How far lenses of phones, cameras and webcams are from a pinhole with its axis in the middle: standard deviations of
 # the numbers of a lens but f. A flat board leaves mostly the principal point open: at twice that, f is half

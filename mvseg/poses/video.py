@@ -17,13 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.poses.numbers import STRUCTURE, VIDEO
 from mvseg.system.running import progress_bar
 
 Grey = NDArray[np.uint8]
-Floats = NDArray[np.float64]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".3gp", ".avi", ".mkv", ".webm")
 SILENT = "-8"  # of FFmpeg's log, which is for its developers

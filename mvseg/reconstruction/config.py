@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError, check_choices
+from mvseg.errors import InputError, check_choices, check_ranges
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,10 @@ class ReconstructConfig:
 
     def __post_init__(self) -> None:
         check_choices(self, "reconstruct")
+        check_ranges(self, "reconstruct", voxel_budget=(1, math.inf))
         if not 0 <= self.threshold < 1:
             raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
         if not 0 <= self.seen_share < 1:
             raise InputError(f"reconstruct.seen_share is {self.seen_share:g}, expected a number in [0, 1)")
         if self.voxel_size is not None and not 0 < self.voxel_size < float("inf"):
             raise InputError(f"reconstruct.voxel_size is {self.voxel_size:g}, expected a positive number")
-        if self.voxel_budget < 1:
-            raise InputError(f"reconstruct.voxel_budget is {self.voxel_budget}, expected at least 1")

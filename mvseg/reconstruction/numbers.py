@@ -223,31 +223,19 @@ class TubeNumbers:
     """Tubes that are fitted to masks of stems, and what tells stems from leaves."""
 
     mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
-    difference: float = 1e-4  # limit: of u, for the directions of a cubic
     # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.6, no stem less than 2.9.
     least_aspect: float = 2.5  # chosen: min. length over width of a stem's surface, over the median of the plant
     rows: int = 24  # limit: places along a tube at which it is compared with its masks
     patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
     num_steps: int = 12  # limit: steps of the fit
     far_steps: int = 8  # limit: of these, until edges are looked for nearby only
-    far_reach: float = 14.0  # chosen: pixels within which a sample looks for an edge, at first
-    near_reach: float = 6.0  # chosen: the same in the end
-    far_scale_px: float = 4.0  # chosen: distance that has half the weight of none, at first
-    least_scale_px: float = 0.7  # chosen: the same in the end, at least
-    scale_factor: float = 4.0  # chosen: the same in median distances, at least
-    sample_weight: float = 0.35  # chosen: weight of a sample, as of those of patches
     end_weight: float = 4.0  # chosen: weight of an end, in that of a sample of a side: there is one of it
     shorten: float = 0.25  # chosen: weight of a mask that ends before the tube, where that of a longer one is 1
     damping: float = 0.01  # limit: of a step, as a share of the diagonal
     most_step: float = 0.1  # limit: max. way of a coefficient in a step, in lengths of the tube
     least_radius: float = 0.05  # limit: min. radius after a step, in the mean one before it
     bend_sd: float = 0.03  # chosen: deviation of third differences of the axis, in lengths
-    speed_sd: float = 0.05  # chosen: deviation of the speed along a piece of the axis, in lengths
     taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
-    sd_factor: float = 2.0  # chosen: factor of deviations, as of those of patches
-    usual_px: float = 0.3  # chosen: min. median distance of the usual view of a leaf
-    sd_of_median: float = 1.48  # definition: standard deviation of normal errors, in median absolute ones
-    quiet_px: float = 0.3  # chosen: root mean square distance above which the factor is larger
     beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
     least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
     most_views: int = 12  # limit: views of a candidate that tell whether it is a stem

@@ -6,12 +6,11 @@ from collections.abc import Hashable, Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import RAYS
 from mvseg.scene import Cameras
 
-Floats = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
 
 

@@ -82,17 +82,13 @@ def _next_step(result: Result, doubt: Finding | None, out: str) -> str:
         return f"answer questions about doubtful leaves: mvseg correct {out}"
     if doubt.code in (*ONE_SIDED, *SIDES):
         return "film or photograph it from half round, and begin again: mvseg pose PHOTOS --out NEW_SCENE"
-    if doubt.code in UNTAUGHT and not has_tried_to_learn(result):
+    has_tried = result.learned.rounds > 0 or len(result.learned.agreed_area) > 1
+    has_tried |= any(each.code in ("learned_too_few", "learning_failed") for each in result.findings)
+    if doubt.code in UNTAUGHT and not has_tried:
         return f"let the views teach the detector this plant: mvseg infer --again {out} --learn 2"
     if doubt.code in (*UNTAUGHT, *BY_HAND):
         return f"outline six leaves in two photos each, and let the detector learn them: mvseg correct {out}"
     return f"compare photos, masks and cameras, view by view: mvseg check {out}"
-
-
-def has_tried_to_learn(result: Result) -> bool:
-    """Whether the detector has tried to learn the plant in this run, or had too few leaves to learn from."""
-    tried = result.learned.rounds > 0 or len(result.learned.agreed_area) > 1
-    return tried or any(each.code in ("learned_too_few", "learning_failed") for each in result.findings)
 
 
 def _count(number: int, one: str, many: str) -> str:

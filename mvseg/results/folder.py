@@ -157,7 +157,7 @@ def _describe_camera(scene: Scene, view: int) -> dict[str, Any]:
 def _annotate(result: Result, region: int) -> dict[str, Any]:
     masks, view = result.masks, int(result.masks.view_index[region])
     instance, kind = int(masks.instance_ids[region]), int(masks.classes[region])
-    track = {"track_id": instance} if instance > 0 else {}
+    track, chance = {"track_id": instance} if instance > 0 else {}, result.instances.probabilities.get(instance)
     origin, score = Origin(int(masks.origin[region])), float(masks.detection_scores[region])
     source: dict[str, Any] = {}
     if origin == Origin.GIVEN:
@@ -174,7 +174,7 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         **track,
         "attributes": {"instance_id": instance} | track,  # what datumaro and CVAT keep
         "match_score": round(float(masks.match_scores[region]), 4),
-        **({"probability": round(chance, 4)} if (chance := _chance_of(result, instance)) is not None else {}),
+        **({} if chance is None else {"probability": round(chance, 4)}),
         **source,
         "segmentation": encode_mask(mask_in_photo(result, region)),
         **_undistorted(result, region, view),
@@ -187,7 +187,3 @@ def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
         return {}
     width, height = result.scene.cameras.sizes[view].tolist()
     return {"undistorted": encode_mask(result.regions.mask(region, width, height).cpu().numpy())}
-
-
-def _chance_of(result: Result, instance: int) -> float | None:
-    return result.instances.probabilities.get(instance)

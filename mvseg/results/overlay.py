@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from mvseg.crop import Box
 from mvseg.masks import SURE, Masks
 
 MAX_SIDE = 1600  # limit: max. pixels of an overlay's longer side
@@ -16,7 +17,6 @@ LEAST_SHARE = 0.05  # limit: min. width of a picture as a share of the photo's: 
 UNMATCHED = (150, 150, 150)  # chosen: RGB of masks without an instance
 CAPITAL = 26  # limit: pixels of the height of OpenCV's digits at scale 1
 
-Box = tuple[int, int, int, int]
 _Number = tuple[str, tuple[int, int], float]  # text, column and row of its middle, radius of the circle that fits there
 
 
@@ -42,9 +42,7 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     longer, regions = max(size), masks.regions
     canvas = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA))
     painted, numbers = canvas.copy(), list[_Number]()
-    members = (regions.view_index == view).nonzero()[:, 0]
-    members = members[regions.areas[members].argsort(descending=True, stable=True)]  # small ones on top
-    for index in members.tolist():
+    for index in regions.large_first(view):
         instance = int(masks.instance_ids[index])
         whole = regions.mask(index, width, height).cpu().numpy().astype(np.uint8)
         mask = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_NEAREST))

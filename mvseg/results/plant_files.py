@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
-from mvseg.formats.text_file import format_number
+from mvseg.formats.text_file import short_number
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
@@ -101,11 +101,7 @@ def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
             "method": leaf.method,
             "use": leaf.use,
             "quality": leaf.quality,
-            "traits": {name: _rounded(number.value) for name, number in numbers.items()},
-            "sd": {name: _rounded(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
+            "traits": {name: short_number(number.value) for name, number in numbers.items()},
+            "sd": {name: short_number(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
         }
     return extras
-
-
-def _rounded(value: float) -> float:
-    return float(format_number(value))

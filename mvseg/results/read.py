@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
-from mvseg.crop import Crop
+from mvseg.crop import Box, Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, check_arguments, faults_of, warn
 from mvseg.findings.finding import Finding, Values
@@ -46,7 +46,6 @@ MOST_INSTANCES = 65534  # definition: number of instances that a label image of 
 READ_FILES = (
     DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "nodes.csv", "surfaces.npz", "voxels.npz"
 )  # fmt: skip
-Box = tuple[int, int, int, int]
 
 
 class _Lens(BaseModel):

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
@@ -21,8 +21,6 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.results.run_record import RunRecord
     from mvseg.traits.measure import Traits
     from mvseg.verification.choose import RejectedCandidate
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,27 +44,15 @@ class Instances:
 
     def close_gaps(self, masks: Masks) -> Instances:
         """The shapes of the instances that have masks, by the ids that `masks.close_gaps()` gives them."""
-        surfaces = None if self.surfaces is None else masks.renumber(self.surfaces)
-        voxels = None if self.voxels is None else masks.renumber(self.voxels)
-        return Instances(
-            probabilities=masks.renumber(self.probabilities),
-            starts=masks.renumber(self.starts),
-            surfaces=surfaces,
-            voxels=voxels,
-        )
+        return self._by(masks.renumber)
 
     def renumber(self, numbers: Mapping[int, int]) -> Instances:
         """Instance k by the id `numbers[k]`."""
+        return self._by(lambda values: {numbers[instance]: each for instance, each in values.items()})
 
-        def by_number(values: Mapping[int, T]) -> dict[int, T]:
-            return {numbers[instance]: each for instance, each in values.items()}
-
-        return Instances(
-            probabilities=by_number(self.probabilities),
-            starts=by_number(self.starts),
-            surfaces=None if self.surfaces is None else by_number(self.surfaces),
-            voxels=None if self.voxels is None else by_number(self.voxels),
-        )
+    def _by(self, renumber: Callable[[Mapping[int, Any]], Any]) -> Instances:
+        surfaces, voxels = (None if each is None else renumber(each) for each in (self.surfaces, self.voxels))
+        return Instances(renumber(self.probabilities), renumber(self.starts), surfaces, voxels)
 
 
 @dataclass(frozen=True)

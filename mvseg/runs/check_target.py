@@ -15,6 +15,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.checks.target_masks import cut_shapes
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.label_png import write_label_png
@@ -30,8 +31,6 @@ from mvseg.results.plant_files import METRES
 from mvseg.results.result import Result
 from mvseg.system.running import progress_bar
 from mvseg.traits.leaf import missing
-
-Floats = NDArray[np.float64]
 
 NORMAL_95 = 1.96  # definition: standard deviations
 # chosen: of lengths; 2 % of areas. More is said to be a wrong scale: printers that fit a page shrink it by 3 %, and

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -90,11 +89,6 @@ def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path 
     places = {"scene": scene, "out": out, "masks": masks, "corrections": corrections}
     absolute = {name: None if path is None else str(path.resolve()) for name, path in places.items()}
     return absolute | {"from_here": {name: path_from(out, path) for name, path in absolute.items() if path is not None}}
-
-
-def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> str:
-    """The command that makes the whole result, or tracks, again, with its options and with corrections."""
-    return shlex.join(["mvseg", verb, "--again", str(folder), "--corrections", str(corrections)])
 
 
 def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence[Path]) -> list[Finding]:

@@ -238,7 +238,7 @@ class Corrector:
     def _describe_learning(self, doing: str) -> dict[str, Any] | None:
         if (learner := self.opened.learner) is None:
             return None
-        seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * learner.num_views
+        seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * len(learner.scene.views)
         return {"now": doing, "isLearned": learner.is_learned, "seconds": seconds}
 
     def _learner(self) -> OpenResult:

@@ -85,23 +85,14 @@ class OpenResult:
         self.learned: tuple[Plant, list[Finding]] | None = None  # since the detector learned the plant
 
     @property
-    def can_learn(self) -> bool:
-        """Whether there is a detector, and views choose what it finds."""
-        return not self.opened.holds
-
-    @property
     def learner(self) -> OpenResult | None:
-        """Itself, where there is a detector that may learn."""
-        return self if self.can_learn else None
+        """Itself, where there is a detector that may learn, and views choose what it finds."""
+        return None if self.opened.holds else self
 
     @property
     def is_learned(self) -> bool:
         """Whether the detector has learned the plant since this was opened."""
         return self.learned is not None
-
-    @property
-    def num_views(self) -> int:
-        return len(self.scene.views)
 
     def read_edits(self) -> tuple[Corrections, str]:
         found = self.saved_corrections()

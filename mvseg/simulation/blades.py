@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.surface.leaf_patch import grid_triangles
 
-Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
 
 BLADE_COLUMNS = 9  # limit: vertices across a blade; odd, so that the midrib is a grid line
@@ -100,24 +100,6 @@ def blade_stations(rows: int) -> Floats:
     return 0.4 * even + 0.6 * (1 - np.cos(np.pi * even)) / 2
 
 
-def blade_faces(rows: int) -> Ints:
-    """(F, 3) faces: a fan at the base vertex, a grid of `rows` x BLADE_COLUMNS vertices, a fan at the tip vertex."""
-    return grid_triangles(rows + 2, BLADE_COLUMNS).astype(np.int32)
-
-
-def grid_faces(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(F, 3) two triangles for each cell of an (r, c) grid of vertex indices; normals point at a viewer who sees the
-    rows run down and the columns run to the right."""
-    a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
-    return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
-
-
-def blade_uv(rows: int) -> Floats:
-    """(P, 2) base-to-tip and edge-to-edge coordinates of the vertices that `place_blade` returns."""
-    u, v = np.meshgrid(blade_stations(rows)[1:-1], np.linspace(-1, 1, BLADE_COLUMNS), indexing="ij")
-    return np.concatenate([[[0.0, 0.0]], np.stack([u.ravel(), v.ravel()], 1), [[1.0, 0.0]]])
-
-
 def half_widths(blade: Blade) -> Floats:
     """(rows,) half-widths of the flattened blade at its inner stations, mm; the largest is width / 2."""
     u = blade_stations(blade.rows)[1:-1]
@@ -158,11 +140,12 @@ def place_blade(blade: Blade, base: Floats, *, azimuth: float, elevation: float)
 def leaf_from_blade(leaf_id: int, vertices: Floats) -> Leaf:
     """The leaf whose vertices (P, 3) `place_blade` returned, with its length, width and area."""
     grid = vertices[1:-1].reshape(-1, BLADE_COLUMNS, 3)
-    faces = blade_faces(len(grid))
+    faces = grid_triangles(len(grid) + 2, BLADE_COLUMNS).astype(np.int32)  # fans at base and tip, a grid between
     midrib = np.concatenate([vertices[:1], grid[:, BLADE_COLUMNS // 2], vertices[-1:]])
     length = float(np.linalg.norm(np.diff(midrib, axis=0), axis=1).sum())
     width = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).sum(1).max())
     corner = vertices[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
-    uv = blade_uv(len(grid))
+    u, v = np.meshgrid(blade_stations(len(grid))[1:-1], np.linspace(-1, 1, BLADE_COLUMNS), indexing="ij")
+    uv = np.concatenate([[[0.0, 0.0]], np.stack([u.ravel(), v.ravel()], 1), [[1.0, 0.0]]])
     return Leaf(leaf_id=leaf_id, vertices=vertices, faces=faces, uv=uv, length=length, width=width, area=float(area))

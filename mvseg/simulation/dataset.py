@@ -107,11 +107,6 @@ def list_specs(preset: Preset, seed: int) -> list[SceneSpec]:
     return scenes
 
 
-def plant_index(scene: SceneSpec) -> int:
-    """Index of the plant of a scene among those of its split and number of leaves."""
-    return int(scene.folder.split("-")[1].split("_")[0])
-
-
 def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, num_workers: int = 1) -> None:
     """Write the scenes of a preset, their list `scenes.csv`, and COCO files where the preset asks for them.
 

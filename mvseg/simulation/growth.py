@@ -13,8 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
-from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_blade, place_blade
+from mvseg.simulation.blades import Arc, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES, Family, draw_blade
 from mvseg.simulation.pot import Part, Pot, draw_pot, lift, make_tube, pot_parts
 

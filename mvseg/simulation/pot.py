@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.simulation.blades import Floats, Ints, grid_faces
+from mvseg.arrays import Floats
+from mvseg.reconstruction.surface.leaf_patch import grid_faces
+from mvseg.simulation.blades import Ints
 from mvseg.simulation.families import Family
 
 TUBE_SIDES = 8  # limit: sides of a tube

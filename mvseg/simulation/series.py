@@ -16,10 +16,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
 from mvseg.formats.text_file import write_table
 from mvseg.scene import Cameras
-from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_blade
+from mvseg.simulation.blades import Arc, Leaf, arc_points, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES, Family
 from mvseg.simulation.growth import (

@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Floats, Leaf, arc_points, leaf_from_blade, place_blade
+from mvseg.arrays import Floats
+from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.pot import Part, make_tube

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 from torch.utils.data import Dataset
 from torchvision import tv_tensors
+from torchvision.ops import masks_to_boxes
 from torchvision.transforms import v2
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.regions import masks_to_boxes
 from mvseg.simulation.skins import list_skins
 from mvseg.training.config import Orientation, TrainConfig
 from mvseg.training.data import SampleList, read_sample
@@ -145,7 +145,8 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
     masks = torch.zeros((len(rows), *layers.shape[1:]), dtype=torch.bool)
     for layer in layers:
         masks |= layer == rows[:, None, None] + 1
-    return {"boxes": masks_to_boxes(masks).float(), "labels": classes[rows], "masks": masks.to(torch.uint8)}
+    boxes = masks_to_boxes(masks) + torch.tensor([0.0, 0, 1, 1])  # torchvision's end on the last pixel
+    return {"boxes": boxes, "labels": classes[rows], "masks": masks.to(torch.uint8)}
 
 
 # --- the order of an epoch

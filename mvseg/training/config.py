@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_ranges
 
 Orientation = Literal["any", "upright", "fixed"]
 
@@ -82,8 +82,7 @@ class TrainConfig:
         clip_norm: gradients with a larger norm are scaled down to it; 0 for never.
         ema_decay: evaluate and export an exponential moving average of the weights with this decay (at step t at most
             (1 + t) / (10 + t)); 0 for none.
-        precision: bf16 (autocast), fp32, or auto: bf16 on GPUs that have it, and on CPUs where two steps at the start
-            show that it is faster. Evaluation is always fp32.
+        precision: bf16 (autocast), fp32, or auto: bf16 on GPUs that have it. Evaluation is always fp32.
         device: cpu, cuda, or auto.
         num_workers: processes that read and augment, per training process; 0 reads in the training process itself.
         seed: of the weights, the order, the augmentation and the samplers of the losses.
@@ -144,18 +143,12 @@ class TrainConfig:
         Raises:
             InputError: a number outside its range; the message names the field.
         """
-        at_least = {"epochs": 1, "batch_size": 1, "images_per_forward": 1, "image_size": 32, "checkpoint_every": 1,
-                    "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0,
-                    "new_plants": 0, "lr": 0.0, "backbone_lr": 0.0, "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
-        for name, bound in at_least.items():
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= bound):
-                raise InputError(f"{name} is {value}, expected at least {bound}")
-        causes = ("blur", "light", "fault", "clutter", "tint")
-        for name in ("color_jitter", *(f"{cause}_probability" for cause in causes), "ema_decay"):
-            value = getattr(self, name)
-            if not 0 <= value <= 1:
-                raise InputError(f"{name} is {value}, expected a number from 0 to 1")
+        numbers = {"epochs": 1, "batch_size": 1, "images_per_forward": 1, "image_size": 32, "checkpoint_every": 1,
+                   "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0,
+                   "new_plants": 0, "lr": 0.0, "backbone_lr": 0.0, "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
+        shares = ("color_jitter", "ema_decay", *(name for name in vars(self) if name.endswith("_probability")))
+        check_ranges(self, **{name: (least, math.inf) for name, least in numbers.items()})
+        check_ranges(self, **dict.fromkeys(shares, (0, 1)))
         if not 0 < self.scale_range[0] <= self.scale_range[1] < math.inf:
             raise InputError(f"scale_range is {self.scale_range}, expected two factors above 0, the smaller one first")
         if self.batch_size % self.images_per_forward:

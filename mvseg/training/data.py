@@ -27,15 +27,16 @@ from mvseg.formats.coco import (
     check_segmentations,
     decode_segmentation,
     read_files,
+    warn_of_crowds,
 )
-from mvseg.formats.find_views import find_views
+from mvseg.formats.find_views import LonePhotos, find_views
 from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
 from mvseg.formats.label_png import ignore_border
 from mvseg.formats.masks.class_numbers import INTERPOLATED, count_between, is_interpolated
 from mvseg.formats.masks.faults import COVERS
 from mvseg.formats.masks.read_views import read_photo_masks
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
-from mvseg.formats.photos import warn_of_turned
+from mvseg.formats.photos import photos_in, warn_of_turned
 from mvseg.scene import View
 
 CATEGORY = "leaf"  # of masks in files that are named after their photo
@@ -61,14 +62,6 @@ class Sample:
     annotations: tuple[CocoAnnotation, ...] = ()
     size: tuple[int, int] | None = None
     class_of: Mapping[str, int] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Photos:
-    """Photos without cameras, as the readers of masks take them; named as the views of a scene are."""
-
-    views: tuple[View, ...]
-    source: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +100,7 @@ def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> Sample
     """
     if not photos.is_dir():
         raise InputError(f"{photos} is not a folder, expected the folder of the photos")
-    paths = sorted(path for path in photos.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+    paths = photos_in(photos, "**/*")
     if not paths:
         raise InputError(f"{photos} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
     by_stem: dict[str, Path] = {}
@@ -115,7 +108,7 @@ def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> Sample
         other = by_stem.setdefault(path.relative_to(photos).with_suffix("").as_posix(), path)
         if other is not path:
             raise InputError(f"{other} and {path} would share one label image, expected one photo per stem")
-    photo_set = _Photos(tuple(View(stem, path) for stem, path in by_stem.items()))
+    photo_set = LonePhotos(tuple(View(stem, path) for stem, path in by_stem.items()))
     masks = recognise_masks(photo_set, labels)
     if masks.kind == "COCO":
         return _list_coco(photos, photo_set, masks, crowd=crowd)
@@ -135,7 +128,7 @@ def _list_lone(photos: Path, labels: Path, masks: MaskFiles) -> list[Sample]:
     return [Sample(name=stem.as_posix(), photo=photos / stem, kind=masks.kind) for stem in stems]
 
 
-def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
+def _list_coco(photos: Path, photo_set: LonePhotos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
     """Samples that a COCO file lists. Classes 1, 2, ... are the categories, ordered by their ids."""
     labels, content = masks.source, read_files(masks.files[0], photo_set)
     categories = sorted(content.categories, key=lambda category: (isinstance(category.id, str), category.id))
@@ -154,9 +147,7 @@ def _list_coco(photos: Path, photo_set: _Photos, masks: MaskFiles, *, crowd: Cro
     with faults_of(labels):
         check_segmentations((each.segmentation, size_of[str(each.image_id)]) for each in content.annotations)
     num_crowds = sum(bool(annotation.iscrowd) for annotation in content.annotations)
-    if num_crowds:
-        code = "crowds_taken" if crowd == "mask" else "crowds_ignored"
-        warn(Finding(code, str(labels), {"count": num_crowds, "option": "coco_crowd"}))
+    warn_of_crowds(labels, num_crowds, crowd, option="coco_crowd")
     class_of = {str(category.id): number for number, category in enumerate(categories, start=1)}
     samples = []
     for image, view in zip(content.images, views, strict=True):

@@ -8,8 +8,7 @@ processes, except for the order in which gradients are added up: torchvision nor
 one forward call, and these are the same images.
 
 All randomness is a function of the seed and the step. A killed run therefore resumes with the same bits (on a CPU, with
-the same number of threads) without the state of any generator or scheduler in its checkpoint. Only `precision: auto`
-measures time, once; the checkpoint keeps the decision.
+the same number of threads) without the state of any generator or scheduler in its checkpoint.
 
 Files in `output`: run.json (what the folder is), config.yaml (resolved), log.jsonl (losses by step), metrics.json (by
 epoch), model.safetensors (the best epoch by mask AP; without validation samples the last), checkpoint.pt,
@@ -50,7 +49,6 @@ from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
 from mvseg.training.data import SampleList, keep_sound, list_samples
 from mvseg.training.from_results import list_results
-from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
 from mvseg.training.state import TrainingState, apply_gradients, learning_rate, save_state, start_state
 from mvseg.training.validation import detect_and_label
@@ -114,8 +112,6 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
             with ExitStack() as stack:
                 config.output.mkdir(parents=True, exist_ok=True)
                 processes.ask_first(lambda: stack.enter_context(lock_folder(config.output)))
-                if state.is_bf16 is None:
-                    state.is_bf16 = processes.ask_first(lambda: try_precision(run, state))
                 run_epochs(run, state)
 
 
@@ -216,7 +212,7 @@ def add_gradients(run: Run, state: TrainingState, *, network: nn.Module, chunks:
         torch.manual_seed(mix_seed(config.seed, state.step, number))  # torchvision samples anchors and RoIs at random
         is_last = number == numbers[-1]  # DDP averages the gradients over the processes once, with the last chunk
         with network.no_sync() if isinstance(network, DistributedDataParallel) and not is_last else nullcontext():
-            with torch.autocast(processes.device.type, torch.bfloat16, enabled=bool(state.is_bf16)):
+            with torch.autocast(processes.device.type, torch.bfloat16, enabled=state.is_bf16):
                 losses = network(photos, targets)
             losses = {name: value.float() for name, value in losses.items()}
             losses["loss"] = torch.stack(list(losses.values())).sum()
@@ -233,13 +229,6 @@ def not_finite(what: str, run: Run, state: TrainingState, indices: list[int]) ->
     names = ", ".join(photos[index] if index < len(photos) else f"new plant {index}" for index in indices)
     which = f"the {what} of step {state.step} (epoch {len(state.history) + 1})"
     return InputError(f"{which} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
-
-
-def try_precision(run: Run, state: TrainingState) -> bool:
-    """Whether this run is to be in bfloat16, by a forward pass of its own."""
-    samples = AugmentedSamples(run.samples, run.config)
-    photos, targets, _ = collate([samples[0, index % len(samples)] for index in range(run.config.images_per_forward)])
-    return choose_bf16(run.config, state.model, photos=photos, targets=targets)
 
 
 def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from mvseg.errors import InputError
 from mvseg.evaluation.labelled_photo import LabelledPhoto, label_photo
-from mvseg.formats.image_file import PHOTO_SUFFIXES, read_rgb
+from mvseg.formats.image_file import read_rgb
+from mvseg.formats.photos import photos_in
 from mvseg.scene import Cameras
 from mvseg.training.photo_faults import draw
 
@@ -95,7 +96,7 @@ def list_backgrounds(folder: Path | None) -> tuple[Path, ...]:
     """The photos of a folder in the order of their names; none without one. Raises InputError: no folder or photo."""
     if folder is None:
         return ()
-    found = sorted(path for path in folder.glob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+    found = photos_in(folder)
     if not found:
         raise InputError(f"backgrounds is {folder}, expected a folder of photos without leaves")
     return tuple(found)

@@ -36,7 +36,7 @@ class TrainingState:
         step: steps done since the start of the run.
         history: one record per epoch that was trained and evaluated.
         loss_sums: sums of the losses over the steps of the unfinished epoch.
-        is_bf16: whether the forward pass runs under bfloat16 autocast; None until that is decided.
+        is_bf16: whether the forward pass runs under bfloat16 autocast.
     """
 
     model: MaskRCNN
@@ -45,7 +45,7 @@ class TrainingState:
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     loss_sums: dict[str, float] = field(default_factory=dict)
-    is_bf16: bool | None = None
+    is_bf16: bool = False
 
     @property
     def result(self) -> MaskRCNN:
@@ -76,7 +76,9 @@ def start_state(
     model.rpn.head.register_forward_hook(leave_autocast)
     model = model.to(device=device, memory_format=torch.channels_last).train()  # a third faster on CPUs
     averaged = copy.deepcopy(model).eval() if config.ema_decay else None
-    state = TrainingState(model, build_optimizer(config, model), averaged)
+    has_bf16 = device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    is_bf16 = has_bf16 if config.precision == "auto" else config.precision == "bf16"
+    state = TrainingState(model, build_optimizer(config, model), averaged, is_bf16=is_bf16)
     if checkpoint.is_file():
         restore_state(state, read_checkpoint(checkpoint, device), config, samples)
         logger.info("resuming from step %d of %s", state.step, checkpoint)

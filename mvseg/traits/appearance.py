@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.color import rgb2hsv
 
+from mvseg.arrays import Floats
 from mvseg.formats.image_file import is_grey
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.traits.leaf import Measurement, missing
-
-Floats = NDArray[np.float64]
 
 BORDER_PX = 2  # chosen: pixels this near to the edge of a mask may show something else
 COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index", "senescent_share", "hue")

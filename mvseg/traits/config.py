@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError, check_choices
+from mvseg.errors import check_choices, check_ranges
 
 Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that points up, or what shows it
 
@@ -34,8 +35,4 @@ class TraitsConfig:
 
     def __post_init__(self) -> None:
         check_choices(self, "traits")
-        if self.min_sure_views < 0:
-            raise InputError(f"traits.min_sure_views is {self.min_sure_views}, expected 0 or more")
-        for name, share in (("min_quality", self.min_quality), ("min_visible_share", self.min_visible_share)):
-            if not 0 <= share <= 1:
-                raise InputError(f"traits.{name} is {share:g}, expected a number in [0, 1]")
+        check_ranges(self, "traits", min_sure_views=(0, math.inf), min_quality=(0, 1), min_visible_share=(0, 1))

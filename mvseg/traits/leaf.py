@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.surface.leaf_patch import patch_basis, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, cell_normals, grid_sizes
 from mvseg.reconstruction.voxels import VoxelGrid
-
-Floats = NDArray[np.float64]
 
 COARSE = (24, 9)  # limit: grid for standard deviations
 END = 0.25  # chosen: share of the midrib whose direction counts as that of its base or tip; less is noise

@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mvseg.reconstruction.stem.leaf_bases import LeafBases, as_tube, curve_of, project_bases
+from mvseg.arrays import Floats
+from mvseg.reconstruction.stem.leaf_bases import LeafBases, curve_of, project_bases
 from mvseg.reconstruction.stem.tube import Tube
 from mvseg.traits.leaf import VAGUE_DEG, Measurement, missing, wrap_azimuth
-
-Floats = NDArray[np.float64]
 
 ARCH_SD_DEG = 6.0  # fitted: python benchmarks/stems.py --cache DIR; of the angle by which petioles bend
 BLADE_SD_DEG = 4.0  # fitted: the same; of the azimuth of a blade near its base against that of its petiole
@@ -142,7 +140,8 @@ def measure_stem(
             sd = float(np.hypot(height_sd[leaf], height_sd[below]))
             internode = Measurement(float(along[leaf] - along[below]), sd, source)
             sd = float(np.hypot(azimuth_sd[leaf], azimuth_sd[below]))
-            divergence = Measurement(_apart(azimuth[leaf], azimuth[below]), sd, source) if sd <= VAGUE_DEG else VAGUE
+            apart = abs((float(azimuth[leaf]) - float(azimuth[below]) + 180) % 360 - 180)
+            divergence = Measurement(apart, sd, source) if sd <= VAGUE_DEG else VAGUE
         turned = Measurement(wrap_azimuth(float(azimuth[leaf])), float(azimuth_sd[leaf]), source)
         x, y, z = on_axis[leaf].tolist()
         bx, by, bz = bases.points[leaf].tolist()
@@ -169,22 +168,12 @@ def measure_stem(
     )
 
 
-def thin_tube(places: Sequence[tuple[float, float, float]]) -> Tube:
-    """A tube without a radius through these places."""
-    points = np.array(places, dtype=float).reshape(-1, 3)
-    return as_tube(points if len(points) > 1 else np.repeat(points, 2, 0), np.zeros(3))
-
-
 def _reference(tangents: Floats, frame: Floats | None) -> Floats:
     """(N, 3) unit vectors across an axis with unit directions (N, 3): where azimuths start."""
     mean = tangents.mean(0) if len(tangents) else np.array([0.0, 0.0, 1.0])
     east = np.eye(3)[np.abs(mean).argmin()] if frame is None else frame[0]
     level = east - (tangents @ east)[:, None] * tangents
     return np.asarray(level / np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12))
-
-
-def _apart(first: float, second: float) -> float:
-    return float(abs((first - second + 180) % 360 - 180))
 
 
 def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:

@@ -12,16 +12,14 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, missing
 from mvseg.traits.ontology import PLANT_TRAITS
-
-Floats = NDArray[np.float64]
 
 NO_LEAVES = missing("not measured: no leaf has a surface")
 FLAT = missing("not measured: the leaves span no volume")

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.photos import Photos
@@ -20,7 +20,6 @@ from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube
 from mvseg.reconstruction.stem.leaf_bases import (
     BaseAxis,
     LeafBases,
-    as_tube,
     axes_of_bases,
     choose_ends,
     curve_of,
@@ -35,8 +34,6 @@ from mvseg.reconstruction.surface.fit_surfaces import instance_frames, stack_ins
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.traits.nodes import Stem, measure_stem
-
-Floats = NDArray[np.float64]
 
 MOST_VIEWS = 20  # limit: photos in which thin parts are looked for
 LEAF_GRID = (24, 7)  # limit: points of a leaf from which its petiole may begin
@@ -101,7 +98,8 @@ def find_stems(
     supported = tuple(axis for axis in axes if plant.support(axis.tube.points()) >= SUPPORTED)
     carried = sum(int(axis.is_near.sum()) for axis in supported) / len(surfaces)
     if supported and carried >= AXES.near_share:  # else what is left of several axes may stand in free air
-        tells_up = len(axes) == 1 and carried >= UP_LEAVES and plant.share_seen(axes[0].tube.points()) >= UP_SEEN
+        is_seen = np.isfinite(share_of_views(plant.views, axes[0].tube.points(), 3 * plant.cells.size))
+        tells_up = len(axes) == 1 and carried >= UP_LEAVES and is_seen.mean() >= UP_SEEN
         return _of_bases(supported, frame, tells_up=tells_up)
     path = find_path(plant.cells, plant.leaves)
     if path is None or plant.support(path.points) < SUPPORTED:
@@ -148,10 +146,6 @@ class SeenPlant:
         shares = share_of_views(self.views, points, 3 * self.cells.size)
         is_seen = np.isfinite(shares)
         return float(np.quantile(shares[is_seen], FAINTEST)) if is_seen.mean() > LEAST_SEEN else 0.0
-
-    def share_seen(self, points: Floats) -> float:
-        """Part of an axis (P, 3) that enough views see."""
-        return float(np.isfinite(share_of_views(self.views, points, 3 * self.cells.size)).mean())
 
 
 def see_plant(surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos) -> SeenPlant:
@@ -277,7 +271,7 @@ def _of_path(
     ends, others = find_ends(surfaces)
     rising = (ends.points + others.points).mean(0) / 2 - path.points[0] if upward is None else upward
     line = path.points if (path.points[-1] - path.points[0]) @ rising >= 0 else path.points[::-1]
-    tube = as_tube(line, np.full(len(path.petioles) + 2, path.miss))
+    tube = Tube.along(line)
     traced = petiole_bases(path, surfaces)
     nearer = choose_ends(ends, others, line)
     nearer = nearer.select(~np.isin(nearer.ids, traced.ids))
@@ -292,7 +286,8 @@ def _of_path(
 
 def petiole_bases(path: StemPath, surfaces: Mapping[int, LeafSurface]) -> LeafBases:
     """Bases of leaves whose petioles were traced without a long gap: where they join the stem, and their direction."""
-    ids = [leaf for leaf, way in path.petioles.items() if _longest_step(way) <= MOST_GAP * path.cell]
+    longest = {leaf: np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0) for leaf, way in path.petioles.items()}
+    ids = [leaf for leaf, step in longest.items() if step <= MOST_GAP * path.cell]
     starts, ahead, near = [], [], []
     for leaf in ids:
         way = path.petioles[leaf]
@@ -313,9 +308,4 @@ def petiole_bases(path: StemPath, surfaces: Mapping[int, LeafSurface]) -> LeafBa
         lengths=np.array([surfaces[leaf].length for leaf in ids]),
         point_sd=np.full(num, path.cell),
         angle_sd=np.zeros(num),
-        is_reversed=np.zeros(num, bool),
     )
-
-
-def _longest_step(way: Floats) -> float:
-    return float(np.linalg.norm(np.diff(way, axis=0), axis=1).max(initial=0))

@@ -7,12 +7,15 @@ from itertools import chain, zip_longest
 from pathlib import Path
 from types import MappingProxyType
 
+import numpy as np
+
 from mvseg.errors import InputError
 from mvseg.formats.text_file import read_table, write_table
+from mvseg.reconstruction.stem.tube import Tube
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import GOOD, LeafTraits, Traits, UpFrom
-from mvseg.traits.nodes import Node, Phyllotaxis, Stem, thin_tube
+from mvseg.traits.nodes import Node, Phyllotaxis, Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
@@ -83,8 +86,7 @@ def read_nodes(path: Path) -> tuple[Stem, ...]:
             raise
         raise InputError(f"{path}: is no table of nodes that mvseg wrote ({error})") from None
     return tuple(
-        Stem(number=stem, tube=thin_tube([node.place for node in each]), source=about[stem][0], nodes=tuple(each),
-             phyllotaxis=about[stem][1])
+        Stem(stem, Tube.along(np.array([node.place for node in each])), about[stem][0], tuple(each), about[stem][1])
         for stem, each in nodes.items()
     )  # fmt: skip
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.markers import find_scene_markers
@@ -14,8 +14,6 @@ from mvseg.formats.photos import Photos
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.config import Up
-
-Floats = NDArray[np.float64]
 
 LEVEL = np.radians(2.0)  # how level cameras are at best
 MOST_TILT = np.radians(10.0)  # root mean square, of cameras that were held level

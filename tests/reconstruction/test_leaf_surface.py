@@ -6,7 +6,8 @@ import torch
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, fit_coefficients, flat_leaf, flat_sheet, make_surface
-from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, Floats, measure_patch, patch_grid
+from mvseg.arrays import Floats
+from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 

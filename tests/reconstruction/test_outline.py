@@ -9,7 +9,7 @@ import pytest
 from benchmarks.faults import disc
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
 from mvseg.reconstruction.numbers import FIT, IMAGE, STACK
-from mvseg.reconstruction.surface.fit_patch import fit_patch, invert_normal, per_view
+from mvseg.reconstruction.surface.fit_patch import fit_patches, invert_normal, per_view
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
     MIDRIB,
@@ -351,12 +351,12 @@ def test_a_patch_that_no_mask_is_near_is_fitted_to_nothing() -> None:
     far = ellipse()
     far[MIDRIB] += (100, 0, 0)
     assert outline_distances(stack(), GRID, far, reach=6.0, is_imaged=True).jacobian.shape == (0, 3 * NUM_COEFFICIENTS)
-    fit = fit_patch(stack(), far, num_steps=FIT.num_steps)
+    fit = fit_patches(stack(), far[None], num_steps=FIT.num_steps)[0]
     assert np.isfinite(fit.coefficients).all()
     assert np.isnan(fit.residual_px).all()
     assert np.isnan(fit.offsets_px).all()
     assert np.isnan(fit.covariance).all()
-    assert np.isfinite(fit_patch(stack(), ellipse(), num_steps=FIT.num_steps).covariance).all()
+    assert np.isfinite(fit_patches(stack(), ellipse()[None], num_steps=FIT.num_steps)[0].covariance).all()
 
 
 def test_the_prior_alone_has_no_inverse_on_any_processor() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
+from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks
 from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube, see_tube, tube_distances
 from mvseg.reconstruction.stem.tube import Tube, axis_slopes, fit_axis, sweep_circle
 from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
@@ -42,7 +42,6 @@ def test_a_tube_of_known_shape_is_found_from_its_masks(shape: str) -> None:
     assert tube.diameter == pytest.approx(2 * np.median(radius), rel=0.05)
     assert miss(tube, points) < 0.02
     assert np.median(tube.iou) > 0.82
-    assert (tube.residual_px < 0.6).all()
     ends = np.sort(tube.radius()[[0, -1]])
     assert ends == pytest.approx(np.sort(radius[[0, -1]]), abs=0.011)
 
@@ -65,9 +64,6 @@ def test_order_of_views_and_scale_of_the_world_do_not_matter() -> None:
     assert turned.length == pytest.approx(first.length, rel=2e-3)
     assert scaled.length / 250 == pytest.approx(first.length, rel=2e-3)
     assert scaled.diameter / 250 == pytest.approx(first.diameter, rel=5e-3)
-    assert scaled.point_deviation(np.array([0.5])) / 250**2 == pytest.approx(
-        first.point_deviation(np.array([0.5])), rel=0.05, abs=1e-9
-    )
 
 
 def test_a_start_saves_the_search_and_an_end_may_be_any() -> None:
@@ -77,7 +73,6 @@ def test_a_start_saves_the_search_and_an_end_may_be_any() -> None:
     assert started.length == pytest.approx(first.length, rel=5e-3)
     back = started.reverse()
     assert np.linalg.norm(back.points()[0] - BENT[0]) < 0.03
-    assert back.point_deviation(np.array([0.1])) == pytest.approx(started.point_deviation(np.array([0.9])))
 
 
 def test_masks_that_show_a_part_and_leaves_in_front_do_not_shorten_it() -> None:
@@ -96,22 +91,10 @@ def test_masks_that_show_a_part_and_leaves_in_front_do_not_shorten_it() -> None:
     assert tube.diameter == pytest.approx(0.12, rel=0.06)
 
 
-def test_deviations_hold_what_other_views_say() -> None:
-    """Of fits to halves of the views, most points are within two deviations of the truth."""
-    points, radius = SHAPES["bent"]
-    dense = cKDTree(np.stack([np.interp(np.linspace(0, 1, 4000), T, axis) for axis in points.T], 1))
-    places, inside = np.linspace(0.05, 0.95, 9), []
-    for cameras in (ring_cameras(5), ring_cameras(6, elevations_deg=(10, 40)), ring_cameras(8, arc_deg=200)):
-        tube = fit_tube(stack(tube_masks(points, radius, cameras), cameras))
-        sd = np.sqrt(np.trace(tube.point_deviation(places), axis1=1, axis2=2))
-        inside += (dense.query(tube.points(places))[0] < 2 * sd).tolist()
-    assert np.mean(inside) > 0.9
-
-
 def test_one_view_and_masks_without_a_common_point_have_none() -> None:
     masks = stack(tube_masks(*SHAPES["bent"]))
     one = fit_tube(masks.select(np.arange(len(masks)) == 0))
-    assert (one.exists, one.reason) == (False, "seen in one view only")
+    assert not one.exists
     assert len(one.mesh().faces) == 0
     away = np.zeros((SIZE, SIZE), bool)
     away[:3, :3] = True
@@ -162,8 +145,6 @@ def test_a_leaf_changes_its_width_and_a_stem_does_not(half_width: float) -> None
     assert stem.width_change < 0.1 < leaf.width_change
     assert leaf.gain < stem.gain
     assert leaf.probability < 0.1 < 0.5 < stem.probability
-    assert stem.width == pytest.approx(0.12, rel=0.06)
-    assert stem.aspect == pytest.approx(length_of(BENT) / 0.12, rel=0.1)
 
 
 def test_evidence_needs_a_surface_and_two_views() -> None:

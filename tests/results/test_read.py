@@ -22,6 +22,7 @@ from mvseg import load_result
 from mvseg.config import RunConfig
 from mvseg.corrections.corrected import Fate
 from mvseg.corrections.file import Corrections, Reject
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.formats.label_png import read_label_png
@@ -32,7 +33,6 @@ from mvseg.matching.result import MatchReport
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
-from mvseg.regions import mask_box
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
 from mvseg.results.run_record import load_run
@@ -150,7 +150,7 @@ def test_crops_are_those_of_whole_masks(height: int, width: int, pixels: list[bo
     counts = encode_mask(mask)["counts"]
     box, crop = decode_crop(counts, width, height)
     whole = decode_rle(counts, width, height)
-    assert box == (mask_box(torch.from_numpy(whole.copy())) if whole.any() else (0, 0, 1, 1))
+    assert box == (Crop.of(whole.copy()).box if whole.any() else (0, 0, 1, 1))
     np.testing.assert_array_equal(crop, whole[box[1] : box[3], box[0] : box[2]])
 
 

@@ -13,10 +13,11 @@ import numpy as np
 import pytest
 from pycocotools.coco import COCO
 
+from benchmarks.label_maps import plant_index
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.simulation import dataset
-from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_specs, plant_index, write_dataset
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_specs, write_dataset
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.system.atomic import lock_folder

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from mvseg.simulation.blades import BLADE_COLUMNS, Blade, Floats, place_blade
+from mvseg.arrays import Floats
+from mvseg.simulation.blades import BLADE_COLUMNS, Blade, place_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant, grow_plant

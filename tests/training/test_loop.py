@@ -126,6 +126,7 @@ def test_best_epoch() -> None:
 
 def test_bf16_on_the_cpu_is_close_to_fp32(leaves: Path, tmp_path: Path, finished: Path) -> None:
     train(make_config(leaves, tmp_path, precision="bf16", epochs=1), build_tiny())
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["is_bf16"] is True
     ours, exact = read_log(tmp_path)[0]["loss"], read_log(finished)[0]["loss"]
     assert ours != exact
     assert ours == pytest.approx(exact, rel=0.05)

@@ -7,6 +7,7 @@ from collections import Counter
 
 import cv2
 import numpy as np
+from scipy.ndimage import maximum_filter, minimum_filter
 
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
@@ -69,20 +70,9 @@ def count_between(labels: np.ndarray) -> np.ndarray:
             continue
         band = band[:, max(columns[0] - 1, 0) : columns[-1] + 2]
         band = np.where(band == IGNORE_LABEL, 0, band).astype(np.uint16)
-        low, high = (_of_neighbours(band, pick) for pick in (np.minimum, np.maximum))
+        low, high = minimum_filter(band, 3, mode="nearest"), maximum_filter(band, 3, mode="nearest")  # without threads
         counts += [np.count_nonzero(low != high), np.count_nonzero((low < band) & (band < high))]
     return counts
-
-
-def _of_neighbours(band: np.ndarray, pick: np.ufunc) -> np.ndarray:
-    """Least or largest number of each pixel and its neighbours, without OpenCV, whose threads do not survive a fork."""
-    for axis in (0, 1):
-        before, spread = np.moveaxis(band, axis, 0), band.copy()
-        after = np.moveaxis(spread, axis, 0)
-        pick(after[1:], before[:-1], out=after[1:])
-        pick(after[:-1], before[1:], out=after[:-1])
-        band = spread
-    return band
 
 
 def is_interpolated(between: np.ndarray) -> bool:

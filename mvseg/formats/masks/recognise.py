@@ -11,7 +11,6 @@ from pathlib import Path
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.find_views import PhotoSet, base_name, find_views
-from mvseg.formats.masks.other_json import refuse_other
 from mvseg.formats.masks.yolo import YOLO_TRACKS, has_tracks
 
 # Endings of files that are named after their photo; longer ones first, since `_seg.npy` ends on `.npy`.
@@ -180,7 +179,6 @@ def _name_kind(kind: str, files: Files) -> str:
         data = first.read_bytes()
     except OSError as error:
         raise InputError(f"{first}: cannot be read ({error.strerror})") from None
-    refuse_other(first, data)
     return "labelme" if b'"shapes"' in data else "SAM"
 
 

@@ -9,16 +9,16 @@ import pycolmap
 import torch
 from torch import Tensor
 
+from mvseg.crop import Box, Crop
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding, list_findings
 from mvseg.formats.lens import undistort
 from mvseg.formats.masks.class_numbers import check_numbers, count_between
 from mvseg.formats.masks.faults import mask_faults
-from mvseg.regions import Regions, label_boxes, mask_box, stack_regions
+from mvseg.regions import Regions, label_boxes, stack_regions
 from mvseg.scene import Scene
 
 ViewMasks = np.ndarray | Iterable[tuple[int, np.ndarray]]
-Box = tuple[int, int, int, int]
 SAME = 0.75  # definition: IoU of two masks of one object; that of 20 x 8 pixels, moved by one along both sides, has it
 Cropped = tuple[int, Box | None, np.ndarray]  # number, box (None: no pixel), and the pixels (h, w) bool in the box
 
@@ -89,8 +89,8 @@ def _crop_masks(
 ) -> Iterator[Cropped]:
     for label, mask in masks:
         shown = undistort(mask.view(np.uint8), lens, K).view(bool)
-        x1, y1, x2, y2 = box = mask_box(torch.from_numpy(shown)) if shown.any() else (0, 0, 0, 0)
-        yield label, box if x2 else None, shown[y1:y2, x1:x2]
+        crop = Crop.of(shown) if shown.any() else None
+        yield (label, None, shown) if crop is None else (label, crop.box, crop.pixels.numpy())
 
 
 def _without_copies(regions: Regions, *, source: object) -> Regions:

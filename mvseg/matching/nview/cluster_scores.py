@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import COSTS, GAINS, SEARCH
 from mvseg.matching.nview.hypothesis_index import pack_views
 from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, run_starts
@@ -26,8 +27,6 @@ WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
 # fitted: the same
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
 
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 Key = TypeVar("Key")
 
 
@@ -43,9 +42,9 @@ class ViewGains:
     """
 
     clusters: Ints
-    score: Floats
-    coverage: Floats
-    total: Floats
+    score: Reals
+    coverage: Reals
+    total: Reals
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +57,16 @@ class ClusterScores:
 
     sweep: PlaneSweep
     graph: ViewGraph
-    _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, repr=False)
-    _coverages: dict[bytes, Floats] = field(default_factory=dict, repr=False)
-    _own: dict[bytes, Floats] = field(default_factory=dict, repr=False)
+    _scores: dict[tuple[int, bytes], Reals] = field(default_factory=dict, repr=False)
+    _coverages: dict[bytes, Reals] = field(default_factory=dict, repr=False)
+    _own: dict[bytes, Reals] = field(default_factory=dict, repr=False)
 
     @cached_property
-    def evidence(self) -> Floats:
+    def evidence(self) -> Reals:
         """(D, D) float32 epipolar evidence for (> 0) or against (< 0) a pair of regions being one instance."""
         return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + GAINS.prior).astype(np.float32)
 
-    def scores(self, view: int, numbers: Ints) -> Floats:
+    def scores(self, view: int, numbers: Ints) -> Reals:
         """Leave-one-out scores of the regions of one view in clusters, S(n, c).
 
         A hypothesis scores (views that show c - hidden * views that show others - missing or absent * views that show
@@ -79,7 +78,7 @@ class ClusterScores:
         """
         return self._region_scores(view, self._members_elsewhere(view, numbers))
 
-    def coverages(self, clusters: Clusters) -> Floats:
+    def coverages(self, clusters: Clusters) -> Reals:
         """(K, D) float32: share of the pixels of cluster c in other views than n's whose best hypothesis shows n.
 
         The best hypothesis is chosen without n's view; pixels whose best hypothesis scores below 0 do not count, and
@@ -89,11 +88,11 @@ class ClusterScores:
         found = _look_up(self._coverages, keys, lambda new: self._cover(clusters, np.array(new)))
         return np.stack(found) if found else np.zeros((0, len(clusters.ids)), np.float32)
 
-    def own(self, clusters: Clusters) -> Floats:
+    def own(self, clusters: Clusters) -> Reals:
         """(D,) score of each region in its own cluster, its own view left out."""
         members = clusters.members
 
-        def score(new: list[int]) -> list[Floats]:
+        def score(new: list[int]) -> list[Reals]:
             fresh = self._score_own(clusters, np.array(new))
             return [fresh[members[k]] for k in new]
 
@@ -113,14 +112,14 @@ class ClusterScores:
         is_together = ~clusters.is_alone
         return float(self.own(clusters)[is_together].mean()) if is_together.any() else 0.0
 
-    def explained_per_view(self, clusters: Clusters) -> Floats:
+    def explained_per_view(self, clusters: Clusters) -> Reals:
         """(V,) float64: `explained` of the regions of each view; NaN without any."""
         is_together = ~clusters.is_alone
         views, scores = self.sweep.view_index[is_together], self.own(clusters)[is_together]
         counts, total = (np.bincount(views, weights, self.sweep.num_views) for weights in (None, scores))
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
-    def gains(self, view: int, numbers: Ints, coverages: Floats) -> ViewGains:
+    def gains(self, view: int, numbers: Ints, coverages: Reals) -> ViewGains:
         """Gains of the regions of one view from joining the clusters of the other views. `numbers` (D,) are clusters in
         [0, K), -1 for regions to leave out; `coverages` may be older: newer clusters cover nothing."""
         here, members = self.sweep.regions_of[view], self._members_elsewhere(view, numbers)
@@ -144,12 +143,12 @@ class ClusterScores:
         elsewhere = np.where(self.sweep.view_index == view, -1, numbers)
         return members_of(elsewhere, int(numbers.max(initial=-1)) + 1)
 
-    def _region_scores(self, view: int, members: list[Ints]) -> Floats:
+    def _region_scores(self, view: int, members: list[Ints]) -> Reals:
         keys, here = [(view, each.tobytes()) for each in members], self.sweep.regions_of[view]
         found = _look_up(self._scores, keys, lambda new: self._score_clusters(view, [members[k] for k in new]))
         return np.stack(found, 1) if found else np.zeros((here.stop - here.start, 0), np.float32)
 
-    def _score_clusters(self, view: int, members: list[Ints]) -> Floats:
+    def _score_clusters(self, view: int, members: list[Ints]) -> Reals:
         regions, pixels = self.sweep.regions_of[view], self.sweep.pixels_of[view]
         owner = self.sweep.pixel_region[pixels] - regions.start
         start = run_starts(owner)
@@ -159,7 +158,7 @@ class ClusterScores:
             score[:, owner[start]] = np.add.reduceat(self._score_pixels(view, members), start, 1) / counts
         return score
 
-    def _score_pixels(self, view: int, members: list[Ints]) -> Floats:
+    def _score_pixels(self, view: int, members: list[Ints]) -> Reals:
         """(C, P) float32: the scores of the view's pixels in C clusters without members in this view."""
         pixels, here = self.sweep.pixels_of[view], self.sweep.hypotheses_of[view]
         least = np.float32(-COSTS.hidden)
@@ -172,7 +171,7 @@ class ClusterScores:
         best.ravel()[place[start]] = np.maximum(np.maximum.reduceat(score, start), least)
         return best
 
-    def _score_hypotheses(self, hypotheses: Ints, count: Ints, *, views: NDArray[np.uint64]) -> Floats:
+    def _score_hypotheses(self, hypotheses: Ints, count: Ints, *, views: NDArray[np.uint64]) -> Reals:
         """(R,) float32, from `count` (R,) views with members; `views` (W, R): bits of the cluster's views."""
         empty_views = self.sweep.empty_views
         missing = np.zeros(len(hypotheses), np.float32)
@@ -185,7 +184,7 @@ class ClusterScores:
         return score
 
     @cached_property
-    def _costs_without_members(self) -> Floats:
+    def _costs_without_members(self) -> Reals:
         """(I,) float32: what each hypothesis costs a cluster that none of its views shows."""
         share = np.bitwise_count(self.sweep.empty_views).sum(0, dtype=np.float32) / self.sweep.num_inside
         return np.float32(COSTS.hidden) + np.float32(COSTS.absent - COSTS.hidden) * share
@@ -196,7 +195,7 @@ class ClusterScores:
             has_region[number, self.sweep.view_index[regions]] = True
         return has_region
 
-    def _cover(self, clusters: Clusters, asked: Ints) -> Floats:
+    def _cover(self, clusters: Clusters, asked: Ints) -> Reals:
         sweep, num_regions, num_views = self.sweep, len(clusters.ids), self.sweep.num_views
         index_of = np.full(len(clusters), -1)
         index_of[asked] = np.arange(len(asked))
@@ -220,7 +219,7 @@ class ClusterScores:
             part += np.bincount(place, share[hit], part.size).reshape(part.shape)
         return (covered / np.maximum(num_pixels, 1e-9)[:, sweep.view_index]).astype(np.float32)
 
-    def _may_be_best(self, hypotheses: Ints, score: Floats) -> NDArray[np.bool_]:
+    def _may_be_best(self, hypotheses: Ints, score: Reals) -> NDArray[np.bool_]:
         """(R,) may it be its pixel's best without one view, which gives 1 or costs `missing` or `absent` at most?"""
         num_inside, pixel = self.sweep.num_inside[hypotheses], self.sweep.pixel[hypotheses]
         total, others = score * num_inside, np.maximum(num_inside - 1, 1)
@@ -229,7 +228,7 @@ class ClusterScores:
         best = np.maximum(np.maximum.reduceat(least, start), 0)
         return most + SEARCH.slack >= np.repeat(best, np.diff(start, append=len(pixel)))
 
-    def _score_own(self, clusters: Clusters, asked: Ints) -> Floats:
+    def _score_own(self, clusters: Clusters, asked: Ints) -> Reals:
         sweep, hidden = self.sweep, COSTS.hidden
         best = np.full(len(sweep.pixel_region), -hidden)
         for hypotheses, score, _ in self._own_hypotheses(clusters, asked):
@@ -239,7 +238,7 @@ class ClusterScores:
         counts = np.bincount(sweep.pixel_region, minlength=len(clusters.ids))
         return np.bincount(sweep.pixel_region, best, len(clusters.ids)) / np.maximum(counts, 1)
 
-    def _own_hypotheses(self, clusters: Clusters, asked: Ints) -> Iterator[tuple[Ints, Floats, NDArray[np.bool_]]]:
+    def _own_hypotheses(self, clusters: Clusters, asked: Ints) -> Iterator[tuple[Ints, Reals, NDArray[np.bool_]]]:
         """Blocks of hypotheses (R,) on rays of clusters `asked`, scores in their own cluster, and views (R, V)."""
         sweep = self.sweep
         is_asked = np.zeros(len(clusters), bool)
@@ -256,8 +255,8 @@ class ClusterScores:
 
 
 def best_elsewhere(
-    gain: Floats, is_inside: NDArray[np.bool_], pixel: Ints, *, own_view: Ints
-) -> tuple[Ints, Ints, Floats]:
+    gain: Reals, is_inside: NDArray[np.bool_], pixel: Ints, *, own_view: Ints
+) -> tuple[Ints, Ints, Reals]:
     """The best hypotheses of each pixel when one view does not count.
 
     Args:
@@ -284,9 +283,7 @@ def best_elsewhere(
     return hypothesis, view, 1 / np.bincount(tie)[tie]
 
 
-def _look_up(
-    cache: dict[Key, Floats], keys: list[Key], compute: Callable[[list[int]], Iterable[Floats]]
-) -> list[Floats]:
+def _look_up(cache: dict[Key, Reals], keys: list[Key], compute: Callable[[list[int]], Iterable[Reals]]) -> list[Reals]:
     new = [place for place, key in enumerate(keys) if key not in cache]
     if new:
         cache.update(zip((keys[place] for place in new), compute(new), strict=True))

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from mvseg.arrays import Ints
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,14 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import EM, SWEEP
 from mvseg.matching.nview.plane_sweep import EMPTY, PlaneSweep, blocks_of_runs, run_starts
 from mvseg.matching.one_per_view import link_average
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
-
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 
 def initial_partitions(sweep: PlaneSweep, graph: ViewGraph) -> list[Clusters]:
@@ -67,8 +65,8 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
     return history
 
 
-def _symmetric(A: Floats) -> Floats:
-    mean: Floats = (A + A.T) / np.float32(2)
+def _symmetric(A: Reals) -> Reals:
+    mean: Reals = (A + A.T) / np.float32(2)
     return mean
 
 
@@ -90,7 +88,7 @@ class _ComparedHypotheses:
     num_empty: Ints
     num_inside: Ints
 
-    def scores(self, affinity: Floats) -> Floats:
+    def scores(self, affinity: Reals) -> Reals:
         """(R,) float32, in the sweep's order: mean affinity (D, D) of the regions, less what empty views cost."""
         flat, num = affinity.ravel(), len(affinity)
         total = np.zeros(len(self.order), np.float32)
@@ -124,7 +122,7 @@ def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
     )
 
 
-def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Floats:
+def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Reals:
     """(D, D) float32: on the rays of how many pixels of the first region some hypothesis names the second."""
     num = len(sweep.view_index)
     counts = np.zeros((num, num), np.float32)
@@ -140,7 +138,7 @@ def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Floats:
     return counts
 
 
-def _share_belief(sweep: PlaneSweep, hypotheses: Ints, belief: Floats) -> Floats:
+def _share_belief(sweep: PlaneSweep, hypotheses: Ints, belief: Reals) -> Reals:
     """(D, D) float32: the summed belief in hypotheses on rays of the first region that name the second."""
     num = len(sweep.view_index)
     mass = np.zeros((num, num), np.float32)

@@ -61,8 +61,9 @@ def match_nview(
     probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
     masks = Masks.of(ordered.to("cpu"), clusters.instance_ids(), probabilities)
     masks = masks.select(order.argsort().cpu())
-    masks = masks.relabel(_final_numbers(masks.instance_ids))
-    return Matching(replace(masks.to(regions.device), regions=regions), report)
+    ids = masks.instance_ids.numpy()
+    final = Clusters.of(ids).drop_singletons().instance_ids()[torch.from_numpy(np.unique(ids, return_index=True)[1])]
+    return Matching(replace(masks.relabel(final).to(regions.device), regions=regions), report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,18 +97,16 @@ def find_clusters(
     scores, residual_px = select_dilation(regions, cameras, graph, pairwise=pairwise, residual_px=residual_px)
 
     def cluster(graph: ViewGraph, unlinked: Clusters | None) -> Clusters:
-        weighed = pairwise if unlinked is None else one_per_view_clusters(graph)
-        starts = [] if unlinked is None else [_free_linked(unlinked, graph)]
-        return search(replace(scores, graph=graph), weighed, more_starts=starts)
+        scored = replace(scores, graph=graph)
+        if unlinked is None:
+            return search(scored, pairwise)
+        free = Clusters.of(np.where(graph.is_linked, len(unlinked) + graph.node, unlinked.ids))
+        return search(scored, one_per_view_clusters(graph), more_starts=[free])
 
     clusters, method = first_without_links(graph, cluster) if len(cameras) > 2 else pairwise, "nview"
     if len(cameras) < 3 or scores.explained(clusters) < NVIEW.unexplained:
         clusters, method = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)), "one-per-view"
     return FoundClusters(clusters, pairwise, scores, residual_px, method)
-
-
-def _free_linked(clusters: Clusters, graph: ViewGraph) -> Clusters:
-    return Clusters.of(np.where(graph.is_linked, len(clusters) + graph.node, clusters.ids))
 
 
 def select_dilation(
@@ -138,8 +137,3 @@ def select_dilation(
     if best == 0:
         return first, NVIEW.dilations[0]
     return score(sweep_planes(regions, cameras, dilation_px=NVIEW.dilations[best])), NVIEW.dilations[best]
-
-
-def _final_numbers(ids: torch.Tensor) -> torch.Tensor:
-    _, first = np.unique(ids.numpy(), return_index=True)
-    return Clusters.of(ids.numpy()).drop_singletons().instance_ids()[torch.from_numpy(first)]

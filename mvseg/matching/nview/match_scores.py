@@ -15,13 +15,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.special import logit
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.partition import Clusters
-
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 # Weights of the columns of `features`, in their order, and of those of `scene_features`.
 REGION = {"always": 1.24, "score": 1.20, "margin": 2.96, "coverage": -0.69, "weight": 1.26, "partners": -0.90,
@@ -45,13 +43,13 @@ class IdEvidence:
         agreement: (D,) share of the regions of other views in this cluster or in the pairwise one that are in both.
     """
 
-    score: Floats
-    margin: Floats
-    coverage: Floats
-    weight: Floats
+    score: Reals
+    margin: Reals
+    coverage: Reals
+    weight: Reals
     num_partners: Ints
     num_fragments: Ints
-    agreement: Floats
+    agreement: Reals
     num_views: int
 
 
@@ -90,7 +88,7 @@ def _count_partners(clusters: Ints, view_index: Ints) -> tuple[Ints, Ints]:
     return np.bincount(clusters)[clusters] - num_fragments, num_fragments
 
 
-def features(evidence: IdEvidence) -> Floats:
+def features(evidence: IdEvidence) -> Reals:
     """(D, 8): 1, and what the probability depends on, clipped to the range seen on the development plants."""
     others = max(evidence.num_views - 1, 1)
     return np.stack(
@@ -108,24 +106,20 @@ def features(evidence: IdEvidence) -> Floats:
     )
 
 
-def scene_features(evidence: IdEvidence) -> Floats:
+def scene_features(evidence: IdEvidence) -> Reals:
     """(D, 5): 1, log odds of the region, log odds of the scene, their product, and the agreement with the pairwise
     clusters. Log odds are of the first regression, for the region and for its mean over the matched regions."""
     sure = 1 / (1 + np.exp(-(features(evidence) @ list(REGION.values()))))
     is_matched = evidence.num_partners > 0
     mean = float(sure[is_matched].mean()) if is_matched.any() else 0.0
     agreement = evidence.agreement[is_matched].mean() if is_matched.any() else 0.0
-    region, scene = _log_odds(sure, SUREST[0]), _log_odds(mean, SUREST[1])
+    region = logit(np.clip(sure, 1 - SUREST[0], SUREST[0]))
+    scene = logit(np.clip(mean, 1 - SUREST[1], SUREST[1]))
     ones = np.ones(len(sure))
     return np.stack([ones, region, scene * ones, region * scene, agreement * ones], 1)
 
 
-def match_scores(evidence: IdEvidence) -> Floats:
+def match_scores(evidence: IdEvidence) -> Reals:
     """(D,) in [0, 1]: the probability that each id is right; 0 for regions that are alone."""
     logit = scene_features(evidence) @ list(SCENE.values())
     return np.where(evidence.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)
-
-
-def _log_odds(probability: Floats | float, most: float) -> Floats:
-    clipped = np.clip(probability, 1 - most, most)
-    return np.log(clipped / (1 - clipped))

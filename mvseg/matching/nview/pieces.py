@@ -8,21 +8,18 @@ regression, fitted by `python benchmarks/pieces.py`, says how likely.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import PIECES
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.partition import Clusters
-
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 # Weights of the columns of `piece_features`, in their order.
 PIECE = {"always": 1.28, "other pieces": 0.84, "score": 3.69, "coverage": 4.37, "weight": -3.93}
 
 
-def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Floats]:
+def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Reals]:
     """Take strangers out of their clusters, so that they are alone; links of the user stay. Returns the clusters, those
     of one region included, and (D,) float64: P(a remaining piece shows the leaf of its cluster); 1 for all others."""
     chance = np.ones(len(clusters.ids))
@@ -33,7 +30,7 @@ def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Fl
     return Clusters.of(parted), np.where(leaves, 1.0, chance)
 
 
-def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Floats]:
+def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Reals]:
     """The P regions that are not the best one of their cluster in their view, by leave-one-out score.
 
     Returns:

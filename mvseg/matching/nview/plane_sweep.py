@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Ints
 from mvseg.matching.numbers import SWEEP
 from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses, pack_views
 from mvseg.regions import Regions
@@ -29,9 +30,6 @@ from mvseg.system.running import progress_bar
 # definition: labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
 EMPTY, OUTSIDE = -1, -2
 
-Floats = NDArray[np.float32]
-Ints = NDArray[np.int64]
-
 
 @dataclass(frozen=True, eq=False)
 class PlaneSweep:
@@ -40,17 +38,13 @@ class PlaneSweep:
     Attributes:
         labels: (I, V) int16 or int32, the hypotheses: region index, EMPTY or OUTSIDE; by pixel, then from far to near.
         pixel: (I,) int64, the pixel in [0, Q) whose ray each hypothesis lies on.
-        inverse_depth: (I,) float32, 1 / depth of the hypothesis in the pixel's own camera, mean over its samples.
         pixel_region: (Q,) int64, ordered: the region of each pixel; some pixels have no hypothesis.
-        pixel_xy: (Q, 2) float32, centres.
         view_index: (D,) int64, ordered.
     """
 
     labels: NDArray[np.integer]
     pixel: Ints
-    inverse_depth: Floats
     pixel_region: Ints
-    pixel_xy: Floats
     view_index: Ints
     num_views: int
     _hypotheses_of_regions: dict[int, HypothesesOfRegions] = field(default_factory=dict, init=False, repr=False)
@@ -75,7 +69,7 @@ class PlaneSweep:
         return [slice(start, end) for start, end in pairwise(ends)]
 
     @cached_property
-    def num_inside(self) -> Floats:
+    def num_inside(self) -> NDArray[np.float32]:
         """(I,) float32, the number of views that the point of each hypothesis lies in; at least 1."""
         return (self.labels >= EMPTY).sum(1, dtype=np.float32)
 
@@ -132,21 +126,18 @@ def rays_per_region(num_views: int) -> int:
 def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> PlaneSweep:
     """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,)."""
     num_views = len(label_maps.maps)
-    pixels, inverse = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
+    pixels = [np.zeros(0, np.int64)]
     labels = [np.zeros((0, num_views), label_maps.maps[0].numpy().dtype)]
     for view in progress_bar(range(num_views), title, unit="view"):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, SWEEP.chunk) if len(here) else ():
-            pixel, label, inverse_depth = _join_equal(*label_maps.hypotheses(view, xy[chunk]))
+            pixel, label = _join_equal(*label_maps.hypotheses(view, xy[chunk]))
             pixels.append(pixel + int(chunk[0]))
             labels.append(np.ascontiguousarray(label.T))
-            inverse.append(inverse_depth)
     return PlaneSweep(
         labels=np.concatenate(labels),
         pixel=np.concatenate(pixels),
-        inverse_depth=np.concatenate(inverse),
         pixel_region=region.numpy(),
-        pixel_xy=xy.numpy(),
         view_index=regions.view_index.numpy(),
         num_views=num_views,
     )
@@ -202,8 +193,8 @@ class _LabelMaps:
     maps: list[Tensor]
     boxes: list[tuple[float, float, float, float] | None]
 
-    def hypotheses(self, view: int, xy: Tensor) -> tuple[Ints, NDArray[np.integer], Floats]:
-        """Along the rays of P pixels of one view: pixel (I,) in [0, P), labels (V, I), inverse depth (I,)."""
+    def hypotheses(self, view: int, xy: Tensor) -> tuple[Ints, NDArray[np.integer]]:
+        """Along the rays of P pixels of one view, from far to near: pixel (I,) in [0, P), labels (V, I)."""
         others = torch.tensor([other for other in range(len(self.maps)) if other != view])
         bases, offsets = self._project_rays(view, xy, others)
         low, high = self._inverse_range(bases, offsets, others)
@@ -220,7 +211,7 @@ class _LabelMaps:
         most_empty = np.maximum(np.floor(SWEEP.max_empty * (num_empty + num_labels)), 1)
         keep = (num_labels > 0) & (num_empty <= most_empty) & np.repeat(is_seen.numpy(), SWEEP.depths)
         kept = np.flatnonzero(keep)
-        return kept // SWEEP.depths, labels.take(kept, 1), inverse.numpy().ravel()[kept]
+        return kept // SWEEP.depths, labels.take(kept, 1)
 
     def _project_rays(self, view: int, xy: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """Bases (O, P, 3) float32, offsets (O, 3) float64: inverse depth w projects to base + w * offset."""
@@ -278,14 +269,12 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
     return found
 
 
-def _join_equal(pixel: Ints, labels: NDArray[np.integer], inverse: Floats) -> tuple[Ints, NDArray[np.integer], Floats]:
+def _join_equal(pixel: Ints, labels: NDArray[np.integer]) -> tuple[Ints, NDArray[np.integer]]:
     """Join runs of equal columns of `labels` (V, I) on a ray; drop those that only lack regions of a neighbour."""
     if not len(pixel):
-        return pixel, labels, inverse
+        return pixel, labels
     is_new = np.append(True, (labels[:, 1:] != labels[:, :-1]).any(0) | (pixel[1:] != pixel[:-1]))
     start = np.flatnonzero(is_new)
-    counts = np.diff(np.append(start, len(pixel)))
-    inverse = (np.add.reduceat(inverse, start) / counts).astype(np.float32)
     pixel, labels = pixel[start], labels.take(start, 1)
     for _ in range(SWEEP.dominance_passes):
         same_ray = pixel[1:] == pixel[:-1]
@@ -298,8 +287,8 @@ def _join_equal(pixel: Ints, labels: NDArray[np.integer], inverse: Floats) -> tu
         if keep.all():
             break
         kept = np.flatnonzero(keep)
-        pixel, labels, inverse = pixel[kept], labels.take(kept, 1), inverse[kept]
-    return pixel, labels, inverse
+        pixel, labels = pixel[kept], labels.take(kept, 1)
+    return pixel, labels
 
 
 def run_starts(values: NDArray[np.integer]) -> Ints:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import GAINS, PIECES, SEARCH
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.initialisation import initial_partitions
@@ -19,9 +20,6 @@ from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_orde
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import Movers
 from mvseg.system.running import progress_bar
-
-Floats = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 
 def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[Clusters] = ()) -> Clusters:
@@ -90,7 +88,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     return Clusters.of(joined)
 
 
-def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) -> ViewGains:
+def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Reals) -> ViewGains:
     """Gains of the movers from joining the other regions' clusters, summed over nodes; -inf where they cannot."""
     graph, rest = scores.graph, ids.copy()
     rest[movers.rows] = -1

@@ -12,12 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.numbers import ERRORS, TUBE
+from mvseg.arrays import Floats
+from mvseg.reconstruction.numbers import ERRORS, FIT, PRIOR, TUBE
 from mvseg.reconstruction.stem.tube import AXIS, RADIUS, Tube, axis_slopes, fit_axis, tube_places
 from mvseg.reconstruction.surface.find_starts import start_in
 from mvseg.reconstruction.surface.fit_patch import invert_normal, per_view
 from mvseg.reconstruction.surface.hull import carve_hull
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, patch_grid, spline_basis
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, patch_grid, spline_basis, unit_vectors
 from mvseg.reconstruction.surface.mask_errors import winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import OutlineSamples, search_edges
@@ -28,8 +29,8 @@ ENDS = [0, TUBE.rows - 1]  # of the places at which a tube is compared
 
 
 def fit_tube(masks: MaskStack, start: Floats | None = None, *, mask_sd_px: float = 0.0) -> Tube:
-    """Fit a tube to the masks of one stem, in two views or more. The tube is in the world of `masks`; where there is
-    none, it says why.
+    """Fit a tube to the masks of one stem, in two views or more. The tube is in the world of `masks`; there is none
+    where the masks do not tell where it runs.
 
     Args:
         start: (P, 3) points roughly along the axis, from end to end, as the midrib of a patch; None: the axis is looked
@@ -38,45 +39,35 @@ def fit_tube(masks: MaskStack, start: Floats | None = None, *, mask_sd_px: float
             photos; 0 for exact ones.
     """
     if len(masks) < 2:
-        return Tube.none(masks.views, "seen in one view only")
+        return Tube.none()
     rough = _start_in_hull(masks) if start is None else start
     if rough is None:
-        return Tube.none(masks.views, "its masks agree on no point")
+        return Tube.none()
     length = float(np.linalg.norm(np.diff(rough, axis=0), axis=1).sum())
     centre = rough.mean(0)
     if not length > 0:
-        return Tube.none(masks.views, "its masks agree on no point")
+        return Tube.none()
     moved = masks.move_worlds(centre[None], np.array([length]))
     axis = fit_axis((rough - centre) / length)
     state, offsets = _State(axis, np.full(RADIUS, _first_radius(moved, axis))), np.zeros(len(masks))
     for step in range(TUBE.num_steps + 1):
         share = min(1.0, step / TUBE.far_steps)
-        reach = TUBE.far_reach + (TUBE.near_reach - TUBE.far_reach) * share
+        reach = FIT.far_reach + (FIT.near_reach - FIT.far_reach) * share
         distances = tube_distances(moved, state.axis, state.radii, reach=reach)
         if step >= TUBE.far_steps // 2:
             sides = distances.is_side
             measured = per_view(distances.px[sides], distances.stack[sides], len(masks))
             offsets = believe_offsets(measured, mask_sd_px / masks.pixel_size)
             distances = distances.without(offsets)
-        weight = _weigh(distances, TUBE.far_scale_px + (TUBE.least_scale_px - TUBE.far_scale_px) * share)
+        weight = _weigh(distances, FIT.far_scale_px + (FIT.least_scale_px - FIT.far_scale_px) * share)
         if step < TUBE.num_steps:
             state = _step(state, distances, weight)
-    covariance = _covariance(state, distances, weight)
-    if not np.isfinite(covariance).all():
-        return Tube.none(masks.views, "its masks do not tell where it runs")
-    scale = np.append(np.full(3 * AXIS, length), np.full(RADIUS, length))
-    squares = np.bincount(distances.stack, weight * distances.px**2, len(masks))
-    with np.errstate(invalid="ignore"):
-        rms = np.sqrt(squares / np.bincount(distances.stack, weight, len(masks)))
-    return Tube(
-        axis=state.axis * length + centre,
-        radii=state.radii * length,
-        covariance=covariance * np.outer(scale, scale),
-        views=masks.views,
-        residual_px=rms * masks.pixel_size,
-        iou=tube_ious(moved, state.axis, state.radii, offsets=offsets),
-        offsets_px=offsets * masks.pixel_size,
-    )
+    rows, _ = _prior(state)
+    normal = (distances.jacobian.T * weight) @ distances.jacobian + rows.T @ rows
+    if not np.isfinite(invert_normal(normal)).all():  # the masks do not tell where it runs
+        return Tube.none()
+    iou = tube_ious(moved, state.axis, state.radii, offsets=offsets)
+    return Tube(state.axis * length + centre, state.radii * length, iou)
 
 
 def believe_offsets(measured: Floats, sd_px: float) -> Floats:
@@ -165,7 +156,7 @@ def tube_distances(masks: MaskStack, axis: Floats, radii: Floats, *, reach: floa
     """How far both sides and both ends of a tube are from the edges of its masks; edges beyond `reach` do not count."""
     u = tube_places(TUBE.rows)
     basis, by_radius = spline_basis(u, AXIS), spline_basis(u, RADIUS)
-    ribbon = see_tube(masks.px_from_world, basis @ axis, _unit(axis_slopes(u) @ axis))
+    ribbon = see_tube(masks.px_from_world, basis @ axis, unit_vectors(axis_slopes(u) @ axis))
     half = (ribbon.per_radius * np.maximum(by_radius @ radii, 0))[..., None] * ribbon.normals
     num = len(u)
     place = np.concatenate([np.arange(num), np.arange(num), ENDS])
@@ -194,7 +185,7 @@ def tube_ious(masks: MaskStack, axis: Floats, radii: Floats, *, offsets: Floats)
     """(S,) IoU of a tube and the mask in each view, where nothing else hides them. The tube is drawn too large or small
     by `offsets` (S,) pixels, as the mask of each view is."""
     u = tube_places(TUBE.rows)
-    middle = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
+    middle = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, unit_vectors(axis_slopes(u) @ axis))
     half = (middle.per_radius * np.maximum(spline_basis(u, RADIUS) @ radii, 0))[..., None] * middle.normals
     px = middle.px.copy()
     px[:, ENDS] = _tips(middle, np.pi / 4 * spline_basis(u, RADIUS) @ radii)[0]  # rectangles of the area of round ends
@@ -211,7 +202,7 @@ def _caps(ribbon: Ribbon) -> Floats:
 
 def _tips(ribbon: Ribbon, radius: Floats) -> tuple[Floats, Floats]:
     """(S, 2, 2) where both ends of a tube with radii (M,) end in the images, and unit vectors (S, 2, 2) outwards."""
-    ahead = _unit(ribbon.ahead[:, ENDS]) * np.array([[-1.0], [1.0]])
+    ahead = unit_vectors(ribbon.ahead[:, ENDS]) * np.array([[-1.0], [1.0]])
     return ribbon.px[:, ENDS] + (_caps(ribbon) * np.maximum(radius[ENDS], 0))[..., None] * ahead, ahead
 
 
@@ -235,21 +226,16 @@ def midrib_of(coefficients: Floats) -> Floats:
 def _first_radius(masks: MaskStack, axis: Floats) -> float:
     """Half the median width of the masks across the axis; at least half a pixel."""
     width, _ = apparent_widths(masks, axis)
-    pixel = _pixel_size(masks)
+    depth, rows = np.maximum(masks.px_from_world[:, 2, 3], 1e-9), masks.px_from_world[:, :2, :3]
+    pixel = float(np.median(depth / np.maximum(np.linalg.norm(rows, axis=2).max(1), 1e-12)))
     return float(max(np.nanmedian(width) / 2, pixel / 2)) if np.isfinite(width).any() else pixel
-
-
-def _pixel_size(masks: MaskStack) -> float:
-    depth = np.maximum(masks.px_from_world[:, 2, 3], 1e-9)
-    rows = masks.px_from_world[:, :2, :3]
-    return float(np.median(depth / np.maximum(np.linalg.norm(rows, axis=2).max(1), 1e-12)))
 
 
 def apparent_widths(masks: MaskStack, axis: Floats) -> tuple[Floats, Floats]:
     """(S, M) widths of the mask in each view around an axis (6, 3), at M places along it: world units, and pixels. NaN
     where nothing of the mask is there, another instance borders or interrupts it, or the view looks along the axis."""
     u = tube_places(TUBE.rows + 2)[1:-1]
-    ribbon = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, _unit(axis_slopes(u) @ axis))
+    ribbon = see_tube(masks.px_from_world, spline_basis(u, AXIS) @ axis, unit_vectors(axis_slopes(u) @ axis))
     half = max(masks.size) // 2
     steps = np.arange(-half, half + 1.0)
     px = ribbon.px[:, :, None] + steps[:, None] * ribbon.normals[:, :, None]
@@ -266,8 +252,8 @@ def apparent_widths(masks: MaskStack, axis: Floats) -> tuple[Floats, Floats]:
 
 def _weigh(distances: TubeDistances, scale_px: float) -> Floats:
     spread = float(np.median(np.abs(distances.px))) if len(distances.px) else 0.0
-    scale = max(scale_px, TUBE.scale_factor * spread)
-    return np.asarray(TUBE.sample_weight * distances.weight / (1 + (distances.px / scale) ** 2))
+    scale = max(scale_px, FIT.scale_factor * spread)
+    return np.asarray(FIT.sample_weight * distances.weight / (1 + (distances.px / scale) ** 2))
 
 
 def _prior(state: _State) -> tuple[Floats, Floats]:
@@ -277,7 +263,7 @@ def _prior(state: _State) -> tuple[Floats, Floats]:
     speeds = np.diff(spline_basis(u, AXIS), axis=0) * AXIS
     ahead = speeds @ state.axis
     length = np.linalg.norm(ahead, axis=1).mean()
-    even = (speeds[:, :, None] * _unit(ahead)[:, None]).reshape(AXIS, -1) / (TUBE.speed_sd * length)
+    even = (speeds[:, :, None] * unit_vectors(ahead)[:, None]).reshape(AXIS, -1) / (PRIOR.speed_sd * length)
     mean = max(float(np.abs(state.radii).mean()), 1e-9)
     taper = np.diff(np.eye(RADIUS), 1, axis=0) / (TUBE.taper_sd * mean)
     rows = np.zeros((len(bend) + len(even) + len(taper), SIZE))
@@ -285,7 +271,7 @@ def _prior(state: _State) -> tuple[Floats, Floats]:
     rows[len(bend) : -len(taper), : 3 * AXIS] = even
     rows[-len(taper) :, 3 * AXIS :] = taper
     target = np.zeros(len(rows))
-    target[len(bend) : -len(taper)] = 1 / TUBE.speed_sd
+    target[len(bend) : -len(taper)] = 1 / PRIOR.speed_sd
     return rows, target
 
 
@@ -304,19 +290,3 @@ def _step(state: _State, distances: TubeDistances, weight: Floats) -> _State:
     share = min(1.0, TUBE.most_step / max(longest, 1e-12))
     radii = state.radii + share * step[3 * AXIS :]
     return _State(state.axis + share * moved, np.maximum(radii, TUBE.least_radius * np.abs(state.radii).mean()))
-
-
-def _covariance(state: _State, distances: TubeDistances, weight: Floats) -> Floats:
-    """(21, 21): the fit's own, and what the views contradict each other by; NaN where the masks do not tell."""
-    rows, _ = _prior(state)
-    jacobian = distances.jacobian
-    inverse = invert_normal((jacobian.T * weight) @ jacobian + rows.T @ rows)
-    pulls = np.zeros((int(distances.stack.max(initial=0)) + 1, SIZE))
-    np.add.at(pulls, distances.stack, jacobian * (weight * distances.px)[:, None])
-    between = inverse @ pulls.T
-    rms = float(np.sqrt((weight * distances.px**2).sum() / max(weight.sum(), 1e-12)))
-    return np.asarray((TUBE.sd_factor * max(1.0, rms / TUBE.quiet_px)) ** 2 * inverse + between @ between.T)
-
-
-def _unit(vectors: Floats) -> Floats:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

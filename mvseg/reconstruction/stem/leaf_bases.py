@@ -12,9 +12,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import AXES
-from mvseg.reconstruction.stem.tube import AXIS, RADIUS, Tube, axis_slopes, fit_axis, tube_places
-from mvseg.reconstruction.surface.leaf_patch import Floats, patch_basis, spline_basis
+from mvseg.reconstruction.stem.tube import AXIS, Tube, axis_slopes, tube_places
+from mvseg.reconstruction.surface.leaf_patch import patch_basis, spline_basis
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 
@@ -30,7 +31,6 @@ class LeafBases:
         lengths: (N,) of the leaves.
         point_sd: (N,) standard deviation of the points, along any axis.
         angle_sd: (N,) standard deviation of the directions, radians.
-        is_reversed: (N,) bool, the end at u = 1 of the surface is the base.
     """
 
     ids: NDArray[np.int64]
@@ -40,7 +40,6 @@ class LeafBases:
     lengths: Floats
     point_sd: Floats
     angle_sd: Floats
-    is_reversed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -83,7 +82,6 @@ def _ends(surfaces: Mapping[int, LeafSurface], *, is_reversed: bool) -> LeafBase
         lengths=np.array([surface.length for surface in surfaces.values()]),
         point_sd=point_sd,
         angle_sd=angle_sd,
-        is_reversed=np.full(len(surfaces), is_reversed),
     )
 
 
@@ -139,17 +137,8 @@ def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAx
     if float(np.ptp(along[is_near])) < AXES.least_extent * width:
         return None
     rising = bases.ahead[is_near].sum(0) if up is None else up
-    tube = as_tube(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1], distances[is_near])
+    tube = Tube.along(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1])
     return BaseAxis(tube, bases, is_near)
-
-
-def as_tube(points: Floats, distances: Floats) -> Tube:
-    """A tube of no radius along points (P, 3), as uncertain as the rays (M,) miss it."""
-    nothing = np.zeros(0)
-    sd = float(np.sqrt((distances**2).mean() / max(len(distances) - 2, 1) * AXIS / 2))
-    covariance = np.diag(np.append(np.full(3 * AXIS, sd**2), np.zeros(RADIUS)))
-    views = np.zeros(0, np.int64)
-    return Tube(fit_axis(points), np.zeros(RADIUS), covariance, views, nothing, nothing, nothing)
 
 
 def _start_lines(first: LeafBases, second: LeafBases, up: Floats | None, *, size: float) -> list[tuple[Floats, Floats]]:

@@ -15,9 +15,9 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import AXES, THIN
 from mvseg.reconstruction.stem.thin_parts import ThinCells
-from mvseg.reconstruction.surface.leaf_patch import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,15 +27,11 @@ class StemPath:
     Attributes:
         points: (P, 3) along it, smooth, from one end to the other.
         cell: side of a cell.
-        miss: median distance of its cells from the smooth line.
-        share: mean share of the views that show its cells as thin.
         petioles: {leaf: (n, 3) from the line to the leaf}, n >= 1.
     """
 
     points: Floats
     cell: float
-    miss: float
-    share: float
     petioles: Mapping[int, Floats]
 
 
@@ -51,11 +47,8 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
     if joined[root] < THIN.least_leaves:
         return None
     trunk = _find_trunk(graph, list(leaves)[root])
-    line = _fit_line(cells, trunk)
-    if line is None:
-        return None
-    points, miss, share = line
-    return StemPath(points, cells.size, miss, share, _find_petioles(graph, cells, leaves, points))
+    points = _fit_line(cells, trunk)
+    return None if points is None else StemPath(points, cells.size, _find_petioles(graph, cells, leaves, points))
 
 
 def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
@@ -70,8 +63,8 @@ def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
     return np.asarray(np.maximum(np.minimum(cells, num - cells), 1) - 1)
 
 
-def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> tuple[Floats, float, float] | None:
-    """A smooth line along the cells of a trunk, its median miss and mean share; None where they lie on none."""
+def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> Floats | None:
+    """(P, 3) a smooth line along the cells of a trunk; None where they lie on none."""
     members = np.flatnonzero(trunk > 0)
     if len(members) < THIN.least_steps:
         return None
@@ -103,8 +96,7 @@ def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> tuple[Floats, float
         return None
     even = (np.linspace(along[close].min(), along[close].max(), AXES.points) - middle) / scale
     line = origin + (even * scale + middle)[:, None] * ahead
-    line = line + np.stack([np.ones_like(even), even, even**2], 1) @ bend
-    return line, float(np.median(gap[close])), float(cells.share[members[close]].mean())
+    return np.asarray(line + np.stack([np.ones_like(even), even, even**2], 1) @ bend)
 
 
 def _find_petioles(graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats) -> dict[int, Floats]:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter, uniform_filter
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import THIN
-from mvseg.reconstruction.surface.leaf_patch import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,15 +26,11 @@ class ThinView:
         share: (h, w) float32 in [0, 1], how surely a pixel differs from its surroundings; 0 in leaves.
         is_hidden: (h, w) bool, in or next to a leaf.
         px_from_world: (3, 4), to its pixels.
-        scale: pixels of the photo per pixel.
-        corner: (2,) pixels of the photo, where it begins.
     """
 
     share: NDArray[np.float32]
     is_hidden: NDArray[np.bool_]
     px_from_world: Floats
-    scale: float
-    corner: Floats
 
 
 def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world: Floats, points: Floats) -> ThinView:
@@ -62,7 +58,7 @@ def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world
     matrix = px_from_world.copy()
     matrix[:2] -= low[:, None] * matrix[2]
     matrix[:2] *= np.array([[width / (high[0] - low[0])], [height / (high[1] - low[1])]])
-    return ThinView(np.where(hidden, 0, share).astype(np.float32), hidden, matrix, scale, low.astype(float))
+    return ThinView(np.where(hidden, 0, share).astype(np.float32), hidden, matrix)
 
 
 @dataclass(frozen=True, eq=False)

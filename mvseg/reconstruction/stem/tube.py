@@ -11,10 +11,10 @@ from functools import cached_property
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
-from mvseg.reconstruction.numbers import TUBE
-from mvseg.reconstruction.surface.leaf_patch import Floats, spline_basis
+from mvseg.arrays import Floats
+from mvseg.reconstruction.numbers import FIT, TUBE
+from mvseg.reconstruction.surface.leaf_patch import spline_basis
 
 COUNTS = (6, 3)  # definition: coefficients of the axis, vectors, and of the radius
 AXIS, RADIUS = COUNTS
@@ -28,39 +28,23 @@ class Tube:
     Attributes:
         axis: (6, 3) float64 coefficients; NaN where no tube could be fitted.
         radii: (3,) float64 coefficients of the radius.
-        covariance: (21, 21) float64 of axis, row by row, and radii.
-        views: (S,) int64, the views whose masks it was fitted to.
-        residual_px: (S,) float64, root mean square distance between its outline and the mask's edge; NaN where no part
-            of the outline has an edge of the mask near it.
-        iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it.
-        offsets_px: (S,) float64, by how much the mask of each view is too large, as the tube sees it.
-        reason: why there is none; "" where it exists.
+        iou: (S,) float64, with the mask in each view it was fitted to, without the pixels of instances that may hide
+            it.
     """
 
     axis: Floats
     radii: Floats
-    covariance: Floats
-    views: NDArray[np.int64]
-    residual_px: Floats
     iou: Floats
-    offsets_px: Floats
-    reason: str = ""
 
     @staticmethod
-    def none(views: NDArray[np.int64], reason: str) -> Tube:
-        """No tube, and why."""
-        size = 3 * AXIS + RADIUS
-        nothing = np.full(len(views), np.nan)
-        return Tube(
-            axis=np.full((AXIS, 3), np.nan),
-            radii=np.full(RADIUS, np.nan),
-            covariance=np.full((size, size), np.nan),
-            views=views,
-            residual_px=nothing,
-            iou=nothing,
-            offsets_px=nothing,
-            reason=reason,
-        )
+    def none() -> Tube:
+        """No tube."""
+        return Tube(np.full((AXIS, 3), np.nan), np.full(RADIUS, np.nan), np.zeros(0))
+
+    @staticmethod
+    def along(points: Floats) -> Tube:
+        """A tube of no radius along points (P, 3)."""
+        return Tube(fit_axis(points), np.zeros(RADIUS), np.zeros(0))
 
     @property
     def exists(self) -> bool:
@@ -75,12 +59,6 @@ class Tube:
         """(P,) at places u (P,), by default `NUM_ROWS` from end to end."""
         return np.maximum(spline_basis(tube_places(NUM_ROWS) if u is None else u, RADIUS) @ self.radii, 0)
 
-    def point_deviation(self, u: Floats) -> Floats:
-        """(P, 3, 3) covariances of the axis at places u (P,)."""
-        basis = np.kron(spline_basis(u, AXIS), np.eye(3)).reshape(len(u), 3, 3 * AXIS)
-        size = 3 * AXIS
-        return np.asarray(basis @ self.covariance[:size, :size] @ basis.transpose(0, 2, 1))
-
     @cached_property
     def length(self) -> float:
         """Along the axis."""
@@ -93,11 +71,7 @@ class Tube:
 
     def reverse(self) -> Tube:
         """The same tube from its other end."""
-        order = np.concatenate([
-            np.arange(3 * AXIS).reshape(AXIS, 3)[::-1].ravel(), 3 * AXIS + np.arange(RADIUS)[::-1]
-        ])  # fmt: skip
-        covariance = self.covariance[np.ix_(order, order)]
-        return replace(self, axis=self.axis[::-1], radii=self.radii[::-1], covariance=covariance)
+        return replace(self, axis=self.axis[::-1], radii=self.radii[::-1])
 
     def mesh(self) -> trimesh.Trimesh:
         """Closed mesh with normals outwards; empty without a tube."""
@@ -113,7 +87,7 @@ def tube_places(count: int) -> Floats:
 
 def axis_slopes(u: Floats) -> Floats:
     """(P, 6) rows that give dx/du of the axis at places u (P,)."""
-    low, high = np.clip(u - TUBE.difference, 0, 1), np.clip(u + TUBE.difference, 0, 1)
+    low, high = np.clip(u - FIT.difference, 0, 1), np.clip(u + FIT.difference, 0, 1)
     slopes: Floats = (spline_basis(high, AXIS) - spline_basis(low, AXIS)) / (high - low)[:, None]
     return slopes
 

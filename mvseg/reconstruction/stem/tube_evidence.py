@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import FIT, TUBE
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.stem.fit_tube import apparent_widths, believe_offsets, fit_tube, midrib_of
 from mvseg.reconstruction.stem.tube import Tube
 from mvseg.reconstruction.surface.fit_surfaces import instance_frames, stack_instance
-from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack
@@ -34,33 +34,18 @@ class TubeEvidence:
     """Evidence that a candidate is a stem; NaN where the views do not tell.
 
     Attributes:
-        tube_iou: median IoU of the tube and the masks.
-        patch_iou: the same of its surface, on the same pixels.
+        gain: median IoU by which the tube explains the masks better than the surface does, on the same pixels; negative
+            for leaves.
         width_change: by how much views differ in the width of the same place: standard deviation of logarithms, median
             along the tube, minus the effect of pixels and of masks too large or small. About 0 for stems.
-        width: median over places and views, world units.
-        length: along the tube, world units.
         relative_aspect: length over width of its surface, over the median of the plant's surfaces. Leaves that are long
             and narrow are so on the whole plant.
     """
 
     tube: Tube
-    tube_iou: float
-    patch_iou: float
+    gain: float
     width_change: float
-    width: float
-    length: float
     relative_aspect: float
-
-    @property
-    def gain(self) -> float:
-        """IoU by which the tube explains the masks better than the patch does; negative for leaves."""
-        return self.tube_iou - self.patch_iou
-
-    @property
-    def aspect(self) -> float:
-        """Length over width."""
-        return self.length / self.width if self.width > 0 else float("nan")
 
     @property
     def features(self) -> tuple[float, float, float, float]:
@@ -120,15 +105,12 @@ def compare_tube(
 ) -> TubeEvidence:
     """The evidence of the masks of one candidate with a surface, which must exist. `usual_aspect` is the median length
     over width of the plant's surfaces; `mask_sd_px` as in `fit_tube`."""
-    coefficients = surface.coefficients.numpy()
     relative_aspect = surface.length / surface.width / usual_aspect
-    tube = fit_tube(masks, midrib_of(coefficients), mask_sd_px=mask_sd_px)
-    patch = float(np.median(patch_ious(masks, surface, mask_sd_px=mask_sd_px)))
+    tube = fit_tube(masks, midrib_of(surface.coefficients.numpy()), mask_sd_px=mask_sd_px)
     if not tube.exists:
-        nan = float("nan")
-        return TubeEvidence(tube, nan, patch, nan, nan, nan, relative_aspect)
-    change, width = width_change(masks, tube, mask_sd_px=mask_sd_px)
-    return TubeEvidence(tube, float(np.median(tube.iou)), patch, change, width, tube.length, relative_aspect)
+        return TubeEvidence(tube, float("nan"), float("nan"), relative_aspect)
+    gain = float(np.median(tube.iou) - np.median(patch_ious(masks, surface, mask_sd_px=mask_sd_px)))
+    return TubeEvidence(tube, gain, width_change(masks, tube, mask_sd_px=mask_sd_px), relative_aspect)
 
 
 def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> Floats:
@@ -139,17 +121,17 @@ def patch_ious(masks: MaskStack, surface: LeafSurface, *, mask_sd_px: float) -> 
     return view_ious(masks, surface.points(*FIT.grid).numpy(), offsets=offsets)
 
 
-def width_change(masks: MaskStack, tube: Tube, *, mask_sd_px: float) -> tuple[float, float]:
-    """How much the apparent width differs between views (see `TubeEvidence`), and its median. NaN where no place is
-    seen by `TUBE.least_views` views."""
+def width_change(masks: MaskStack, tube: Tube, *, mask_sd_px: float) -> float:
+    """How much the apparent width differs between views (see `TubeEvidence`). NaN where no place is seen by
+    `TUBE.least_views` views."""
     widths, pixels = apparent_widths(masks, tube.axis)
     is_seen = np.isfinite(widths)
     places = is_seen.sum(0) >= TUBE.least_views
     if not places.any():
-        return float("nan"), float("nan")
+        return float("nan")
     logs = np.log(widths[:, places])
     # Masks that are too large as a whole are so on both sides.
     sd_px = max(TUBE.width_noise_px, 2 * mask_sd_px / masks.pixel_size)
     noise = (sd_px / np.maximum(pixels[:, places], 1)) ** 2
     change = np.nanvar(logs, axis=0, ddof=1) - np.nanmean(np.where(is_seen[:, places], noise, np.nan), axis=0)
-    return float(np.sqrt(max(np.median(change), 0))), float(np.nanmedian(widths[:, places]))
+    return float(np.sqrt(max(np.median(change), 0)))

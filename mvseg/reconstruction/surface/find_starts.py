@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import FIT, SEARCH
 from mvseg.reconstruction.spread_views import spread_directions
 from mvseg.reconstruction.surface.fit_patch import FIRST_HALF, SECOND_HALF, approach_patches
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, locate_points
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import measure_sizes
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks
 from mvseg.reconstruction.surface.patch_image import cover_crops, crop_ious, project_points

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import FIT
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, PatchSize, measure_patch, patch_grid, patch_prior
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, PatchSize, measure_patch, patch_grid, patch_prior
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
@@ -56,11 +57,6 @@ def approach_patches(masks: MaskStack, starts: Floats, *, steps: range) -> tuple
         equations = _weigh(distances, masks, offsets, scale_px=scale)
         coefficients = _step(coefficients, equations, FIT.far_step)
     return _from_unit_worlds(coefficients, starts), offsets
-
-
-def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None) -> PatchFit:
-    """Fit one patch (26, 3) to the masks of its leaf, see `fit_patches`."""
-    return fit_patches(masks, start[None], num_steps=num_steps, errors=errors)[0]
 
 
 def fit_patches(

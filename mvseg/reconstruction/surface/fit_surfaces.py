@@ -12,13 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError, check_arguments
 from mvseg.reconstruction.numbers import DOUBTS, FIT, SEARCH
 from mvseg.reconstruction.spread_views import spread_views
 from mvseg.reconstruction.surface.find_starts import area_cost, find_starts, wide_cost
-from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patch, fit_patches
+from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patches
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
-from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stack_masks
@@ -253,7 +254,7 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
         points, margin = patch_grid(*FIT.grid).points(coefficients), float(measure_patch(coefficients).length)
         hiding = hiding_pixels(each.masks, points, each.others, margin=SEARCH.behind * margin)
         masks = replace(each.masks, others=hiding)
-        fit = fit_patch(masks, coefficients, num_steps=FIT.num_steps, errors=each.errors)
+        (fit,) = fit_patches(masks, coefficients[None], num_steps=FIT.num_steps, errors=each.errors)
         fit = replace(fit, spread=first.spread)
         surfaces.append(_surface(masks, fit, offsets=first.offsets_px.numpy(), is_judged=True))
     return surfaces

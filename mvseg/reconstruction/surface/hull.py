@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats, Ints
 from mvseg.reconstruction.numbers import HULL
-from mvseg.reconstruction.surface.leaf_patch import Floats, Ints
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.patch_image import project_points
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells

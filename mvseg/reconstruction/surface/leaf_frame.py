@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats, Ints
 from mvseg.reconstruction.numbers import STARTS
-from mvseg.reconstruction.surface.leaf_patch import Floats, Ints
 from mvseg.scene import nearest_point
 
 

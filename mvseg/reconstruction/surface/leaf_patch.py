@@ -13,23 +13,14 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from mvseg.arrays import Floats, Ints
 from mvseg.reconstruction.numbers import FIT, PRIOR
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 COUNTS = (7, 12, 4, 3)  # definition: m, Q, R, S have so many coefficients; fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
-
-
-def place_stations(num_rows: int) -> Floats:
-    """(num_rows,) places u from 0 to 1, denser at both ends, where the outline is round."""
-    t = np.linspace(0, 1, num_rows)
-    return FIT.even * t + (1 - FIT.even) / 2 * (1 - np.cos(np.pi * t))
 
 
 def spline_basis(u: Floats, count: int) -> Floats:
@@ -83,7 +74,8 @@ class PatchGrid:
 @cache
 def patch_grid(num_rows: int, num_columns: int) -> PatchGrid:
     """The grid that many functions share; treat its arrays as constants."""
-    u, v = place_stations(num_rows), np.linspace(-1, 1, num_columns)
+    t, v = np.linspace(0, 1, num_rows), np.linspace(-1, 1, num_columns)
+    u = FIT.even * t + (1 - FIT.even) / 2 * (1 - np.cos(np.pi * t))  # denser at both ends, where the outline is round
     rows, columns = np.meshgrid(u, v, indexing="ij")
     return PatchGrid(u=u, v=v, basis=patch_basis(rows.ravel(), columns.ravel()))
 
@@ -92,14 +84,19 @@ def grid_triangles(num_rows: int, num_columns: int) -> Ints:
     """(F, 3) triangles of a patch grid whose first and last row are one vertex each. Vertex 0 is the base, vertex 1 +
     (row - 1) * num_columns + column an inner point, the last vertex the tip."""
     inner = 1 + np.arange((num_rows - 2) * num_columns).reshape(num_rows - 2, num_columns)
-    a, b, c, d = (x.ravel() for x in (inner[:-1, :-1], inner[:-1, 1:], inner[1:, 1:], inner[1:, :-1]))
     base, tip = np.zeros(num_columns - 1, int), np.full(num_columns - 1, inner[-1, -1] + 1)
     return np.concatenate([
         np.stack([base, inner[0, :-1], inner[0, 1:]], 1),
-        np.stack([a, d, c], 1),
-        np.stack([a, c, b], 1),
+        grid_faces(inner),
         np.stack([tip, inner[-1, 1:], inner[-1, :-1]], 1),
     ])  # fmt: skip
+
+
+def grid_faces(grid: Ints) -> Ints:
+    """(F, 3) two triangles for each cell of an (r, c) grid of vertex indices; normals point at a viewer who sees the
+    rows run down and the columns run to the right."""
+    a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
+    return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
 
 
 def grid_vertices(points: Floats) -> Floats:
@@ -139,7 +136,7 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: Floats | float)
     length, half, noise = (np.asarray(each)[..., None, None] for each in (size.length, size.half_width, noise))
     bend, side, fold = _difference_rows()
     *frames, pieces = _frames(coefficients)
-    tangents = _unit(_speed_rows() @ coefficients)
+    tangents = unit_vectors(_speed_rows() @ coefficients)
     equations = [bend / (PRIOR.bend_sd * length), side / (PRIOR.side_sd * half)]
     equations += [fold * (noise / (PRIOR.fold_step_sd * half))]
     shear, upright = noise / (PRIOR.shear_sd * half), noise / (PRIOR.normal_sd * half)
@@ -150,16 +147,12 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: Floats | float)
     # a narrow one does.
     directions += [pieces[1][..., 1:-1, :] * (2 * half / (PRIOR.sway_sd * length**2))]
     directions += [tangents / (PRIOR.speed_sd * length)]
-    equations.append(_along(_directed_rows(), np.concatenate(directions, -2)))
+    directed = _directed_rows()[:, :, None] * np.concatenate(directions, -2)[..., None, :]
+    equations.append(directed.reshape(*directed.shape[:-2], -1))
     asked = np.concatenate(equations, -2)
     target = np.zeros(asked.shape[:-1])
     target[..., -tangents.shape[-2] :] = 1 / PRIOR.speed_sd
     return asked, target
-
-
-def _along(rows: Floats, directions: Floats) -> Floats:
-    """(..., E, 78) rows (E, 26) along directions (..., E, 3)."""
-    return (rows[:, :, None] * directions[..., None, :]).reshape(*directions.shape[:-1], -1)
 
 
 @cache
@@ -194,11 +187,11 @@ def _frame_counts() -> tuple[int, ...]:
 def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
     """Directions along, across and normal to the blade, (..., count, 3) each, at the places of `_frame_counts`."""
     ahead, sideways = _frame_rows()
-    along = _unit(ahead @ coefficients)
+    along = unit_vectors(ahead @ coefficients)
     side = sideways @ coefficients[..., SIDE, :]
     # Where the side vector vanishes (pointed ends) the mean one stands in.
     side = side + PRIOR.pointed * coefficients[..., SIDE, :].mean(-2, keepdims=True)
-    across = _unit(side - (side * along).sum(-1, keepdims=True) * along)
+    across = unit_vectors(side - (side * along).sum(-1, keepdims=True) * along)
     (ax, ay, az), (bx, by, bz) = np.moveaxis(along, -1, 0), np.moveaxis(across, -1, 0)
     normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)  # np.cross is slow on few
     ends = np.cumsum(_frame_counts())[:-1]
@@ -215,5 +208,5 @@ def _frame_rows() -> tuple[Floats, Floats]:
     return ahead, spline_basis(middle, COUNTS[1])
 
 
-def _unit(vectors: Floats) -> Floats:
+def unit_vectors(vectors: Floats) -> Floats:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

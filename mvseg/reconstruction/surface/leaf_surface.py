@@ -12,13 +12,13 @@ import torch
 import trimesh
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.crop import Crop
 from mvseg.findings.finding import list_some
 from mvseg.reconstruction.numbers import DOUBTS, FIT
 from mvseg.reconstruction.surface.leaf_patch import (
     MIDRIB,
     NUM_COEFFICIENTS,
-    Floats,
     grid_triangles,
     grid_vertices,
     measure_patch,
@@ -167,9 +167,7 @@ class LeafSurface:
     @property
     def normal(self) -> Tensor:
         """(3,) unit mean normal of the mesh, weighted by area."""
-        mesh = self.mesh()
-        corners = mesh.vertices[mesh.faces]
-        mean = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
+        mean = cell_normals(self.points().numpy()).sum((0, 1))
         return torch.from_numpy(mean / max(float(np.linalg.norm(mean)), 1e-300))
 
     def mesh(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> trimesh.Trimesh:

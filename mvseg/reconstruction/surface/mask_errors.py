@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import ERRORS
-from mvseg.reconstruction.surface.leaf_patch import Floats
 
 
 @dataclass(frozen=True, eq=False)

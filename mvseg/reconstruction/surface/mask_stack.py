@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import find_contours
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import STACK
-from mvseg.reconstruction.surface.leaf_patch import Floats
 
 FRAME = -1  # definition: what lies outside the image has this label
 Labels = NDArray[np.int32]

@@ -12,8 +12,9 @@ from itertools import pairwise, product
 import numpy as np
 import torch
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import RAYS, STEM
-from mvseg.reconstruction.surface.leaf_patch import COUNTS, NUM_COEFFICIENTS, SIDE, Floats
+from mvseg.reconstruction.surface.leaf_patch import COUNTS, NUM_COEFFICIENTS, SIDE
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 

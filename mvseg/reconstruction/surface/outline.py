@@ -15,8 +15,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import IMAGE, OUTLINE
-from mvseg.reconstruction.surface.leaf_patch import Floats, PatchGrid
+from mvseg.reconstruction.surface.leaf_patch import PatchGrid
 from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.patch_image import (
     Projection,

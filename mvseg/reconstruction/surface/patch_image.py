@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import IMAGE, STACK
-from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 
 

@@ -9,6 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import STARTS
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
@@ -17,7 +18,6 @@ from mvseg.reconstruction.surface.leaf_patch import (
     MIDRIB,
     NUM_COEFFICIENTS,
     SIDE,
-    Floats,
     measure_patch,
     spline_basis,
 )

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Floats
 from mvseg.reconstruction import numbers
-from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.mask_errors import MaskErrors
 from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import numpy as np
-
-from mvseg.formats.text_file import format_number
+from mvseg.formats.text_file import short_number
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.traits.leaf import Measurement
@@ -63,8 +61,8 @@ def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Defini
         if not number.exists:
             described[trait.name] = {"why": number.method}
             continue
-        sd = float(format_number(number.sd)) if np.isfinite(number.sd) else None
-        described[trait.name] = {"value": float(format_number(number.value)), "sd": sd, "on": number.method}
+        value, sd = short_number(number.value), short_number(number.sd)
+        described[trait.name] = {"value": value, "sd": sd, "on": number.method}
     return described
 
 

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.crop import Box
 from mvseg.formats.image_file import encode_jpeg
 from mvseg.masks import SURE, Masks
-from mvseg.results.overlay import Box, find_plant, find_thickest
+from mvseg.results.overlay import find_plant, find_thickest
 
 LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # limit: pixels of a picture, at most and at least
 ALL_PIXELS = 24_000_000  # limit: max. pixels of all pictures together: 4 to 9 MB, large enough to correct masks in
@@ -111,10 +112,8 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     """The masks of one view, large ones first, so that small ones lie on top; those outside of the shown part of the
     photo (`box`, xyxy, pixels), too: the user may look for them."""
     regions = masks.regions
-    members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
-    members = members[regions.areas[members].argsort(descending=True, stable=True)]
     outlines = []
-    for region in members.tolist():
+    for region in (each for each in regions.large_first(view) if regions.areas[each]):
         mask = regions.crop(region).cpu().numpy().astype(np.uint8)
         corner = np.array(regions.boxes[region, :2].tolist())
         path, around = trace_mask(mask, corner, box=box)

