@@ -44,7 +44,7 @@ from mvseg.verification.candidates import Candidates, gather_candidates
 from mvseg.verification.choice import choose
 from mvseg.verification.choose import Judges
 from mvseg.verification.evidence import Drawn, draw_views, see
-from mvseg.verification.leaf_scores import FITTED, TERMS, LeafScores, Pairs
+from mvseg.verification.leaf_scores import FITTED, LEAF_TERMS, TERMS, LeafScores, Pairs
 from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
@@ -81,7 +81,7 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
     rows = [masks.proposal for masks in matched]
     fit = Judges(scene.cameras).fit
     candidates = gather_candidates(matched, rows, table=table, fit=fit, cameras=scene.cameras)
-    drawn = draw_views(table.regions, candidates.surfaces, scene.cameras)
+    drawn = draw_views(table.regions, candidates.surfaces, scene.cameras, photos=Photos(scene))
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]
     of_candidate = np.array([main_leaf(leaf[rows]) for rows in members])
@@ -154,10 +154,17 @@ def fit(studies: list[Study]) -> LeafScores:
         fitted = LeafScores(
             shows=regress(FITTED.shows, np.concatenate(shows[0]), np.concatenate(shows[1])),
             matched=regress(FITTED.matched, np.concatenate(matched[0]), np.concatenate(matched[1])),
-            leaf=regress(FITTED.leaf, np.array(leaves[True][0]), np.array(leaves[True][1])),
-            leaf_matched=regress(FITTED.leaf_matched, np.array(leaves[False][0])[:, :4], np.array(leaves[False][1])),
+            leaf=regress(FITTED.leaf, of_terms(FITTED.leaf, leaves[True][0]), np.array(leaves[True][1])),
+            leaf_matched=regress(
+                FITTED.leaf_matched, of_terms(FITTED.leaf_matched, leaves[False][0]), np.array(leaves[False][1])
+            ),
         )
     return fitted
+
+
+def of_terms(weights: Iterable[str], rows: list[np.ndarray]) -> np.ndarray:
+    """(N, T) values of the terms that have a weight, of rows with those of all `LEAF_TERMS`."""
+    return np.array(rows)[:, [list(LEAF_TERMS).index(name) for name in weights]]
 
 
 def mask_samples(each: Study, fitted: LeafScores) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -184,7 +191,7 @@ def leaf_samples(each: Study, candidates: Candidates, fitted: LeafScores) -> lis
         leaf = main_leaf(each.leaf[step.rows]) if len(step.rows) else -1
         if leaf != -2:
             is_right = leaf > 0 and leaf not in seen
-            samples.append((bool(candidates.has_surface[step.candidate]), step.features, is_right, step.chance))
+            samples.append((bool(candidates.has_surface[step.candidate]), step.terms, is_right, step.chance))
         seen.add(leaf)
     return samples
 

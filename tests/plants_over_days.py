@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from known_leaves import make_surface
+from mvseg.arrays import Floats
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
@@ -19,7 +20,7 @@ from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
 from mvseg.scene import Cameras, Scene, View
-from mvseg.tracking.dates import Floats, Number, PlantOnDate, SeenLeaf, resample
+from mvseg.tracking.dates import Number, PlantOnDate, SeenLeaf, resample
 from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.track import Tracks
 from mvseg.traits.filters import Kind

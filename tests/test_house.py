@@ -118,8 +118,8 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 40_060, "benchmarks": 6_800, "tests": 35_750}
-SLACK, MOST_CODE = 400, 23_300
+BUDGET = {"mvseg": 39_640, "benchmarks": 6_800, "tests": 35_750}
+SLACK, MOST_CODE = 400, 22_970
 
 
 @pytest.mark.parametrize("place", BUDGET)

@@ -69,6 +69,8 @@ def run(args: Namespace) -> int:
     span = f"{longest:.3g} {'day' if longest == 1 else 'days'} apart{' at most' if num_dates > 2 else ''}"
     what = f"{num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'}"
     say(f"{asked.folder}: {what} on {num_dates} dates, {span}")
+    if args.report and len(tracked) == 1 and not failed:
+        say(f"Look: {asked.folder / 'tracks.html'}")
     return SOME_FAILED if failed else 0
 
 
@@ -107,8 +109,12 @@ def _read_results(args: Namespace) -> RecordedTracks:
 
 
 def _name_plant(results: Sequence[Path]) -> str:
-    """Common beginning of the names of all results, without a date; "" where it is short."""
-    names = (path.resolve().name for path in results)
-    shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-    name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")
-    return name if len(name) >= LEAST_NAME else ""
+    """Common beginning of the names of all results, without a date; that of their scenes where it is short."""
+    from mvseg.results.run_record import load_run
+
+    for names in ([path.resolve().name for path in results], [Path(load_run(path).scene).name for path in results]):
+        shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+        name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")
+        if len(name) >= LEAST_NAME:
+            return name
+    return ""

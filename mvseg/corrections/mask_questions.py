@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
+from mvseg.arrays import Bools, Ints
 from mvseg.corrections.numbers import QUESTIONS
 from mvseg.corrections.unmasked import Unmasked, find_unmasked
 from mvseg.formats.photos import ReadPhoto
@@ -21,11 +22,8 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import RejectedCandidate
-from mvseg.verification.evidence import Evidence, Ints, paint_view, see_instances
+from mvseg.verification.evidence import Evidence, paint_view, see_instances
 from mvseg.verification.numbers import CHOICE, EVIDENCE
-
-Bools = NDArray[np.bool_]
-
 
 Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
 FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow

@@ -9,13 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Bools, Ints
 from mvseg.corrections.numbers import QUESTIONS
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.verification.leaf_color import has_leaf_color, thin_views
-
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)

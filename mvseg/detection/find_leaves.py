@@ -15,6 +15,7 @@ from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
 from mvseg.errors import collect_warnings
 from mvseg.findings.finding import Finding
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.reconstruction.surface.surface_cache import SurfaceCache
@@ -133,6 +134,7 @@ def find_leaves(
     cameras: Cameras,
     *,
     config: DetectConfig = DetectConfig(),
+    photos: ReadPhoto | None = None,
     cache: SurfaceCache | None = None,
 ) -> PassResult:
     """The views choose leaves and masks from everything that a pass proposes, see `choose_leaves`.
@@ -140,6 +142,7 @@ def find_leaves(
     Args:
         detected: matched with the same cameras.
         config: `verify`, `min_score` and `min_probability`.
+        photos: of the views, for the colours of leaves.
     """
     proposals, first = detected.proposals(cameras), detected.sure.masks.to("cpu")
     matched = [first]
@@ -150,7 +153,7 @@ def find_leaves(
     pixel = int(sides.max()) / detected.longest
     leaves = Leaves.of(matched[0])
     if config.verify:
-        judges = Judges(cameras.to("cpu"), min_probability=config.min_probability, cache=cache)
+        judges = Judges(cameras.to("cpu"), photos=photos, min_probability=config.min_probability, cache=cache)
         with timed("choose"):
             leaves = choose_leaves(proposals, matched, judges)
     return PassResult((detected,), leaves, proposals, tuple(matched), detected.sure.report, pixel)

@@ -150,7 +150,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
         posed = cameras.to("cpu")
         detected = Pass.of(self, detections, posed, min_score=config.min_score)
-        leaves = find_leaves(detected, posed, config=config).leaves
+        leaves = find_leaves(detected, posed, config=config, photos=photos.__getitem__).leaves
         missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
         return _disagreement_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
 

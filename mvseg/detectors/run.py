@@ -22,8 +22,7 @@ from torchvision.ops import batched_nms
 
 from mvseg.detectors.mask_cut import CUT, decide_masks
 
-TOUCHED = 0.15  # chosen: min. part of a side of its box that a mask touches, for the box to grow there
-GROWTH = 0.15  # chosen: way that the side then moves, in spans of the box
+GROWTH = 0.15  # chosen: part of a side that a mask touches, from which the side moves out; and how far, in box spans
 
 
 def run_heads(
@@ -87,7 +86,7 @@ def grow_boxes(detections: dict[str, Tensor], size: tuple[int, int]) -> Tensor:
     sides = torch.stack([inside[:, :, 0], inside[:, 0], inside[:, :, -1], inside[:, -1]], 1).mean(2)
     boxes, (width, height) = detections["boxes"], size
     spans = boxes[:, 2:] - boxes[:, :2]
-    grown = boxes + GROWTH * torch.cat((-spans, spans), 1) * (sides > TOUCHED)
+    grown = boxes + GROWTH * torch.cat((-spans, spans), 1) * (sides > GROWTH)
     return torch.minimum(grown.clamp(min=0), grown.new_tensor([width, height, width, height]))
 
 

@@ -129,7 +129,8 @@ def run_pass(
     """
     with collect_warnings() as findings:
         detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        result = find_leaves(detected, opened.scene.cameras, config=detect, cache=opened.surfaces)
+        photos = opened.photos if opened.photos.exist else None
+        result = find_leaves(detected, opened.scene.cameras, config=detect, photos=photos, cache=opened.surfaces)
     return replace(result, findings=tuple(findings))
 
 

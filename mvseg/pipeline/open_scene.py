@@ -81,6 +81,7 @@ class Opened:
             cameras=self.scene.cameras.to("cpu"),
             has_surfaces=not self.holds or (shapes is not None and shapes.check_ids and shapes.shape != "voxels"),
             holds=self.holds,
+            photos=self.photos if self.photos.exist and not self.holds else None,
             min_probability=detect.min_probability,
             cache=self.surfaces,
         )

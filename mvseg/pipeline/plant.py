@@ -111,7 +111,8 @@ class Plant:
     @cached_property
     def drawn(self) -> tuple[Drawn, ...]:
         """V views of the proposals, see `draw_views`."""
-        return draw_views(self.proposals.regions, (), self.scene.cameras.to("cpu"))
+        judges = self.opened.judges
+        return draw_views(self.proposals.regions, (), judges.cameras, photos=judges.photos)
 
     def draw_ahead(self) -> None:
         """Compute in advance what all edits of detected masks begin with."""

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
-from mvseg.tracking.dates import Floats
+from mvseg.arrays import Floats
 from mvseg.tracking.fitted_costs import POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN

@@ -15,9 +15,9 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError
 from mvseg.tracking.compare import Comparison, Observation, link_chances
-from mvseg.tracking.dates import Floats
 from mvseg.tracking.numbers import LINKING
 
 # fitted: slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import softmax
 
+from mvseg.arrays import Floats
 from mvseg.tracking.align import Poses, guess_chance, list_poses, pose_distances, refine_alignment
 from mvseg.tracking.config import Pots
-from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, bent_costs, fitted_costs
 from mvseg.tracking.leaves import DateLeaves, Pair
 from mvseg.tracking.numbers import ALIGN, LINKING

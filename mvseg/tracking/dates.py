@@ -12,8 +12,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.arrays import Floats
 from mvseg.errors import InputError, collect_warnings
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
@@ -26,7 +26,6 @@ from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 
-Floats = NDArray[np.float64]
 NUMBER = re.compile(r"[+-]?(0|[1-9]\d*|(?=\.\d))(\.\d*)?([eE][+-]?\d+)?")  # 0428 and 2026_04_28 are none
 UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres (a definition)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from mvseg.tracking.dates import Floats
+from mvseg.arrays import Floats
 from mvseg.tracking.leaves import DateLeaves, Pair
 from mvseg.tracking.numbers import COSTS, OBSERVATIONS
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.tracking.dates import Floats, Number
+from mvseg.arrays import Floats
+from mvseg.tracking.dates import Number
 from mvseg.tracking.track import Tracks
 
 TRAITS = (

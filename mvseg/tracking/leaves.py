@@ -7,7 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from mvseg.tracking.dates import Floats, PlantOnDate, SeenLeaf
+from mvseg.arrays import Floats
+from mvseg.tracking.dates import PlantOnDate, SeenLeaf
 from mvseg.tracking.numbers import ALIGN, COSTS, OBSERVATIONS
 
 

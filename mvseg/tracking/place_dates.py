@@ -14,8 +14,8 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
+from mvseg.arrays import Floats
 from mvseg.tracking.align import Poses, align_at, guess_chance, pose_distances, pose_odds
-from mvseg.tracking.dates import Floats
 from mvseg.tracking.numbers import ALIGN
 
 PosesOfPairs = Mapping[tuple[int, int], Poses]

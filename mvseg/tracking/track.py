@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from mvseg.arrays import Floats
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.tracking.associate import Association, link_leaves, pairwise_chances, sum_over_poses
 from mvseg.tracking.compare import Comparison, Observation, compare_dates
 from mvseg.tracking.config import Pots
-from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
+from mvseg.tracking.dates import PlantOnDate, date_of, name_apart, order_dates, read_date
 from mvseg.tracking.leaves import leaves_of
 from mvseg.tracking.numbers import ALIGN
 

@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.arrays import Bools, Floats, Ints
 from mvseg.masks import Masks
 from mvseg.reconstruction.numbers import TUBE
 from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Floats, Ints
 from mvseg.verification.numbers import CHOICE
 
 Fit = Callable[[Masks], Mapping[int, LeafSurface]]

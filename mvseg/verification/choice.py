@@ -8,19 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from mvseg.arrays import Bools, Floats, Ints
 from mvseg.masks import Masks, Origin
 from mvseg.verification.candidates import Candidates
-from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, see
+from mvseg.verification.evidence import Drawn, see
 from mvseg.verification.leaf_scores import (
     FITTED,
     LeafScores,
+    Met,
     Pairs,
     best_masks,
     leaf_chances,
-    leaf_features,
     log_odds,
     show_chances,
 )
+from mvseg.verification.mask_colors import MaskColors
 from mvseg.verification.numbers import CHOICE
 
 
@@ -31,19 +33,16 @@ class Step:
     Attributes:
         candidate: its index.
         chance: P, when the leaves before it had taken their masks.
-        features: (6,) that P follows from.
+        coverage: share of its expected area that its masks show, see `Met`.
+        terms: (T,) that P follows from, as in `LEAF_TERMS`.
         rows: of the masks that it may take.
     """
 
     candidate: int
     chance: float
-    features: Floats
+    coverage: float
+    terms: Floats
     rows: Ints
-
-    @property
-    def shown_share(self) -> float:
-        """Share of its expected area that its masks show, see `leaf_features`."""
-        return float(self.features[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +121,7 @@ def choose(
     rows = Rows.none(len(table), len(candidates)) if rows is None else rows
     is_made = rows.is_leaf & (candidates.source == 0)
     scores = np.where(table.origin == Origin.GIVEN, CHOICE.given, table.detection_scores.double())
-    is_other_class = ~same_class(candidates, table)
+    is_other_class, colors = ~same_class(candidates, table), MaskColors.of(drawn)
     hides, steps, is_leaf, q = np.zeros(len(candidates), bool), list[Step](), rows.is_leaf, rows.shows
     for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
@@ -130,7 +129,14 @@ def choose(
         q[is_other_class] = 0
         q = rows.add_to(q, is_made)
         steps = rank(
-            candidates, q, rows.certain & is_made, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted
+            candidates,
+            q,
+            rows.certain & is_made,
+            drawn=drawn,
+            colors=colors,
+            share=evidence.share,
+            scores=scores,
+            fitted=fitted,
         )
         chances = np.array([each.chance for each in steps])
         least = least_chance(chances) if min_probability is None else min_probability
@@ -185,6 +191,7 @@ def rank(
     certain: Bools,
     *,
     drawn: Sequence[Drawn],
+    colors: MaskColors | None,
     share: Floats,
     scores: Floats,
     fitted: LeafScores,
@@ -197,14 +204,16 @@ def rank(
     sure, rows_of_views, is_first = log_odds(scores), [each.rows for each in drawn], certain.any(0)
     while is_open.any():
         best, row = best_masks(free, rows_of_views)
-        features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
-        chances = np.where(is_first, 1.0, leaf_chances(candidates, features, fitted))
+        met = Met(candidates, best, row, sure, share)
+        clear = met.find_clear(colors) if clear is None else clear
+        chances, terms = leaf_chances(met, clear, fitted)
+        chances = np.where(is_first, 1.0, chances)
         chances = np.where(is_open, np.round(chances, CHOICE.digits), -1.0)
         first = int(chances.argmax())
         own = best[:, first]
         mine = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
         mine = np.union1d(mine, np.flatnonzero(certain[:, first]))
-        steps.append(Step(first, float(chances[first]), features[first], mine))
+        steps.append(Step(first, float(chances[first]), float(met.coverage[first]), terms[:, first], mine))
         is_open[first] = False
         for taken in mine.tolist():
             there = drawn[view[taken]]

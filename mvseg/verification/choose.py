@@ -19,8 +19,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.arrays import Bools, Ints
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -29,7 +31,7 @@ from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import Choice, Rows, choose
-from mvseg.verification.evidence import Bools, Drawn, Ints, draw_views, see
+from mvseg.verification.evidence import Drawn, draw_views, see
 from mvseg.verification.leaf_scores import Pairs, show_chances
 from mvseg.verification.match_again import match_again
 from mvseg.verification.numbers import AGAIN, CHOICE, EVIDENCE, ROUGH
@@ -121,6 +123,7 @@ class Judges:
         cameras: V cameras, on the CPU.
         has_surfaces: whether surfaces judge; otherwise matching and scores do.
         holds: whether masks are held to what they were matched to: given masks.
+        photos: of the views, for the colours of candidates; None: they do not count.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
         cache: of surfaces.
     """
@@ -128,6 +131,7 @@ class Judges:
     cameras: Cameras
     has_surfaces: bool = True
     holds: bool = False
+    photos: ReadPhoto | None = None
     min_probability: float | None = None
     cache: SurfaceCache | None = None
 
@@ -191,7 +195,7 @@ def choose_leaves(
         tables, rows = [edited.concerned(), *tables], [row_of, *rows]
     fit = judges.fit if is_judged else None
     candidates = gather_candidates(tables, rows, table=table, fit=fit, cameras=judges.cameras)
-    views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn)
+    views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
     if judges.holds:
         terms = _hold(terms, edited, candidates, table, row_of)
@@ -301,7 +305,7 @@ def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, is_users:
     surfaces = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
     accepted = [each for each in chosen.steps if each.candidate in taken]
-    shares = [each.shown_share for each in accepted if candidates.has_surface[each.candidate]]
+    shares = [each.coverage for each in accepted if candidates.has_surface[each.candidate]]
     return Leaves(
         masks=masks,
         surfaces={number: each for number, each in enumerate(surfaces, 1) if each is not None and each.is_credible},

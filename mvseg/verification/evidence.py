@@ -12,20 +12,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, hstack
 
+from mvseg.arrays import Bools, Floats, Ints
 from mvseg.crop import Crop
+from mvseg.formats.photos import ReadPhoto
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.numbers import EVIDENCE
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
+from mvseg.verification.numbers import COLORS, EVIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +36,8 @@ class Drawn:
         masks: (P, N) int32 of 0 and 1.
         parts: (P, K) int32, what the surfaces cover as if nothing hid them.
         depth: (K,) of their middles, world units; infinite without a surface.
+        colors: (P,) int64, the colour of each pixel but for its lightness, a number below `COLORS.hues` squared; None
+            without a photo.
         first: the first masks alone, where they were drawn before; None: none of them.
     """
 
@@ -44,6 +45,7 @@ class Drawn:
     masks: csc_array
     parts: csc_array
     depth: Floats
+    colors: Ints | None = None
     first: Drawn | None = None
 
     @cached_property
@@ -69,23 +71,24 @@ class Evidence:
         visible: (D, K) IoU with the part that nothing nearer hides.
         claimed: (D, K) the same, but hidden pixels that the mask shows count as visible: photos know better what
             lies in front.
-        inside: (D, K) share of the mask that lies in the part that nothing nearer hides.
-        within: (D, K) share of the mask that lies in the surface as if nothing hid that.
         share: (V, K) unhidden share of the surface's image; 0 where it has none.
     """
 
     visible: Floats
     claimed: Floats
-    inside: Floats
-    within: Floats
     share: Floats
 
 
 def draw_views(
-    regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras, *, first: Sequence[Drawn] = ()
+    regions: Regions,
+    surfaces: Sequence[LeafSurface | None],
+    cameras: Cameras,
+    *,
+    first: Sequence[Drawn] = (),
+    photos: ReadPhoto | None = None,
 ) -> tuple[Drawn, ...]:
     """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out. `first`: the first of
-    the regions, where these were drawn before; they are not drawn again."""
+    the regions, where these were drawn before; they are not drawn again. `photos`: of the views, for their colours."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
     crops = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
@@ -99,8 +102,17 @@ def draw_views(
         if first_views is not None:
             pixels = hstack((first_views.masks, pixels), format="csc")
         covered = _columns([parts[view] for parts in crops], size, step)
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], first=first_views))
+        colors = None if first_views is None else first_views.colors
+        if photos is not None and colors is None:
+            colors = _number_colors(photos(view)[step // 2 :: step, step // 2 :: step])
+        depth = all_depths[view]
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=depth, colors=colors, first=first_views))
     return tuple(drawn)
+
+
+def _number_colors(photo: NDArray[np.uint8]) -> Ints:
+    lab = cv2.cvtColor(np.ascontiguousarray(photo), cv2.COLOR_RGB2LAB).astype(np.int64) * COLORS.hues // 256
+    return np.asarray((lab[..., 1] * COLORS.hues + lab[..., 2]).ravel(), np.int64)
 
 
 def _depths(surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> Floats:
@@ -140,7 +152,7 @@ def _columns(crops: Sequence[Crop], size: tuple[int, int], step: int) -> csc_arr
 def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
     """The evidence, where the surfaces `hides` (K,) hide what lies behind them, each as a whole, by its middle."""
     shape = num_masks, len(hides)
-    visible, claimed, inside, within = np.zeros((4, *shape))
+    visible, claimed = np.zeros((2, *shape))
     share = np.zeros((len(drawn), len(hides)))
     for view, each in enumerate(drawn):
         seen = _unhidden(each, hides)
@@ -148,9 +160,8 @@ def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
         with_seen = (each.masks.T @ seen).toarray()
         either = np.maximum(areas + sizes - with_seen, 1)
         visible[each.rows], claimed[each.rows] = with_seen / either, each.common / either
-        inside[each.rows], within[each.rows] = (common / np.maximum(areas, 1) for common in (with_seen, each.common))
         share[view] = sizes / np.maximum(each.parts.sum(0), 1)
-    return Evidence(visible=visible, claimed=claimed, inside=inside, within=within, share=share)
+    return Evidence(visible=visible, claimed=claimed, share=share)
 
 
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:

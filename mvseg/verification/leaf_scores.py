@@ -8,27 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.special import expit, logit
 from torch import Tensor
 
+from mvseg.arrays import Floats, Ints
 from mvseg.masks import Masks
 from mvseg.verification.candidates import Candidates
-from mvseg.verification.evidence import Evidence, Floats, Ints
+from mvseg.verification.evidence import Evidence
+from mvseg.verification.mask_colors import MaskColors
 from mvseg.verification.numbers import CHOICE
 
 
 @dataclass(frozen=True)
 class LeafScores:
-    """Log odds are sums of terms, or of features in their order, times their weights.
+    """Log odds are sums of terms, by name, times their weights.
 
     Attributes:
         shows: weights of `TERMS` for a mask to show a candidate with a surface.
         matched: the same for a candidate without one.
-        leaf: weights for a candidate with a surface to be a leaf: see `leaf_features`.
-        leaf_matched: the same for a candidate without one, by the first four of these features.
+        leaf: weights of `LEAF_TERMS` for a candidate with a surface to be a leaf.
+        leaf_matched: the same for a candidate without one.
     """
 
     shows: dict[str, float]
@@ -40,23 +43,18 @@ class LeafScores:
 FITTED = LeafScores(
     shows={"always": 0.656, "detection score": 0.314, "claimed": 1.431, "visible": 0.665},
     matched={"always": -1.632, "detection score": 0.958, "match score": 0.897},
-    leaf={"always": -2.385, "shown": 4.382, "number": 0.913, "detection score": 1.153, "length": 1.157, "fit": 0.387},
-    leaf_matched={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928},
+    leaf={
+        "always": -2.385,
+        "shown": 4.382,
+        "number": 0.913,
+        "detection score": 1.153,
+        "length": 1.157,
+        "fit": 0.387,
+        "color": 2.0,
+        "stem": 2.0,
+    },
+    leaf_matched={"always": -0.732, "shown": 1.986, "number": 1.290, "detection score": 0.928, "color": 2.0},
 )
-
-
-@dataclass(frozen=True, eq=False)
-class ClearLeaves:
-    """Measures of the clear leaves of one plant, by which its other candidates are judged: a plant that the detector
-    has not learned scores low everywhere.
-
-    Attributes:
-        score: median log odds of the detection scores of their masks.
-        length: median, world units.
-    """
-
-    score: float
-    length: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,40 +115,116 @@ def show_chances(pairs: Pairs, fitted: LeafScores = FITTED) -> Floats:
     return np.asarray(expit(np.where(candidates.has_surface, by_surface, by_matching)), np.float64)
 
 
-def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
-    """(K,) P: how likely each candidate is a leaf, and no stem."""
-    by_surface = expit(features @ list(fitted.leaf.values()))
-    by_masks = expit(features[:, : len(fitted.leaf_matched)] @ list(fitted.leaf_matched.values()))
-    chances: Floats = np.where(candidates.has_surface, by_surface * (1 - candidates.stem), by_masks)
-    return chances
+@dataclass(frozen=True, eq=False)
+class ClearLeaves:
+    """Measures of the clear leaves of one plant, by which its other candidates are judged: a plant that the detector
+    has not learned scores low everywhere, and a red one has red leaves.
 
-
-def leaf_features(
-    candidates: Candidates, best: Floats, sure: Floats, *, share: Floats, clear: ClearLeaves | None
-) -> tuple[Floats, ClearLeaves]:
-    """(K, 6): 1; the mean q of the best masks over the views, weighted by what each shows of the surface; the logarithm
-    of the sum of q, plus 0.1; the mean log odds of their detection scores, above that of clear leaves; the logarithm
-    of the length, over theirs, 0 for longer ones (pieces are short); and the log odds of `Candidates.fits`.
-
-    Args:
-        best: (V, K) q of the best mask of each.
-        sure: (V, K) log odds of its detection score.
-        share: (V, K), see `Evidence`.
-        clear: None: the clear leaves are found among these candidates.
+    Attributes:
+        score: median log odds of the detection scores of their masks.
+        length: median, world units.
+        color: (K,) how alike the colours of each candidate are, see `MaskColors.likeness`.
     """
-    weight = np.where(candidates.has_surface, share, best > 0)
-    mean_q = (weight * best).sum(0) / np.maximum(weight.sum(0), 1e-9)
-    number, lengths = best.sum(0), candidates.lengths
-    score = (best * sure).sum(0) / np.maximum(number, 1e-9)
-    if clear is None:
-        is_clear = mean_q >= min(CHOICE.clear, mean_q.max(initial=0))
-        known = lengths[is_clear & candidates.has_surface]
-        clear = ClearLeaves(float(np.median(score[is_clear])), float(np.median(known)) if len(known) else 1.0)
-    relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
-    relative = np.minimum(relative, 0.0)
-    fits = log_odds(candidates.fits)
-    columns = np.ones_like(mean_q), mean_q, np.log(number + CHOICE.some), score - clear.score, relative, fits
-    return np.stack(columns, 1), clear
+
+    score: float
+    length: float
+    color: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Met:
+    """K candidates as the choice meets them, and all that terms of P follow from.
+
+    Attributes:
+        best: (V, K) q of the best mask of each that is free.
+        row: (V, K) its row.
+        scores: (D,) log odds of detection scores.
+        share: (V, K), see `Evidence`.
+    """
+
+    candidates: Candidates
+    best: Floats
+    row: Ints
+    scores: Floats
+    share: Floats
+
+    @cached_property
+    def number(self) -> Floats:
+        """(K,) expected number of right masks."""
+        return np.asarray(self.best.sum(0), np.float64)
+
+    @cached_property
+    def coverage(self) -> Floats:
+        """(K,) mean q of the best masks over the views, weighted by what each must show of the surface."""
+        weight = np.where(self.candidates.has_surface, self.share, self.best > 0)
+        return np.asarray((weight * self.best).sum(0) / np.maximum(weight.sum(0), 1e-9), np.float64)
+
+    def mean(self, values: Floats) -> Floats:
+        """(K,) mean of values (D,) of the best masks, weighted by q."""
+        return np.asarray((self.best * values[self.row]).sum(0) / np.maximum(self.number, 1e-9), np.float64)
+
+    def find_clear(self, colors: MaskColors | None) -> ClearLeaves:
+        """The clear leaves among these candidates."""
+        is_clear = self.coverage >= min(CHOICE.clear, self.coverage.max(initial=0))
+        lengths = self.candidates.lengths[is_clear & self.candidates.has_surface]
+        color = np.zeros(len(is_clear))
+        if colors is not None:
+            weights = np.zeros((len(self.scores), len(is_clear)))
+            np.add.at(weights, (self.row, np.arange(len(is_clear))), self.best)
+            color = colors.likeness(weights, is_clear)
+        score = float(np.median(self.mean(self.scores)[is_clear]))
+        return ClearLeaves(score, float(np.median(lengths)) if len(lengths) else 1.0, color)
+
+
+def _ones(met: Met, _: ClearLeaves) -> Floats:
+    return np.ones_like(met.number)
+
+
+def _coverage(met: Met, _: ClearLeaves) -> Floats:
+    return met.coverage
+
+
+def _number(met: Met, _: ClearLeaves) -> Floats:
+    return np.log(met.number + CHOICE.some)
+
+
+def _score(met: Met, clear: ClearLeaves) -> Floats:
+    return met.mean(met.scores) - clear.score
+
+
+def _length(met: Met, clear: ClearLeaves) -> Floats:
+    """Pieces are short."""
+    lengths = np.where(met.candidates.has_surface, met.candidates.lengths, clear.length)
+    return np.minimum(np.log(np.maximum(lengths, 1e-12) / clear.length), 0.0)
+
+
+def _fit(met: Met, _: ClearLeaves) -> Floats:
+    return log_odds(met.candidates.fits)
+
+
+def _color(_: Met, clear: ClearLeaves) -> Floats:
+    return np.minimum(clear.color, 0.0)
+
+
+def _stem(met: Met, _: ClearLeaves) -> Floats:
+    return np.log(1 - np.minimum(met.candidates.stem, 1 - CHOICE.least_distance))
+
+
+LEAF_TERMS: dict[str, Callable[[Met, ClearLeaves], Floats]] = {
+    "always": _ones, "shown": _coverage, "number": _number, "detection score": _score, "length": _length, "fit": _fit,
+    "color": _color, "stem": _stem,
+}  # fmt: skip
+
+
+def leaf_chances(met: Met, clear: ClearLeaves, fitted: LeafScores = FITTED) -> tuple[Floats, Floats]:
+    """(K,) P, how likely each candidate is a leaf; and (T, K) the terms."""
+    terms = {name: term(met, clear) for name, term in LEAF_TERMS.items()}
+    by_surface, by_masks = (
+        np.asarray(sum(weight * terms[name] for name, weight in sorted(weights.items())), np.float64)
+        for weights in (fitted.leaf, fitted.leaf_matched)
+    )
+    odds = np.where(met.candidates.has_surface, by_surface, by_masks)
+    return np.asarray(expit(odds), np.float64), np.stack(list(terms.values()))
 
 
 def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:

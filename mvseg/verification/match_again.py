@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.arrays import Bools, Floats, Ints
 from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Floats, Ints
 from mvseg.verification.numbers import AGAIN
 
 

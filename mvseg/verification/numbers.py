@@ -72,6 +72,8 @@ class ColorNumbers:
 
     bins: int = 16  # limit: bins of each channel in which colours are counted
     blur: float = 1.0  # chosen: standard deviation of the Gaussian that smooths the counts, in bins
+    hues: int = 32  # limit: bins of each of two colour channels (a and b of CIELAB) in which candidates are compared
+    least_alike: float = 1e-3  # limit: Bhattacharyya's coefficient from which on colours differ entirely
     # On plants that were found whole, 0.15 to 0.39 (stems, soil and pots), where a quarter was found, 0.48 to 0.84.
     unexplained: float = 0.5  # chosen: fraction of leaf-coloured pixels in no mask above which leaves were missed
 

@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.arrays import Bools
 from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
@@ -26,7 +27,6 @@ from mvseg.verification.numbers import SNAP
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])
 
 Pixels = NDArray[np.uint8]
-Bools = NDArray[np.bool_]
 
 
 def snap_masks(

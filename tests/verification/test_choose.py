@@ -21,7 +21,7 @@ from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
 from mvseg.verification.evidence import Evidence, draw_views
-from mvseg.verification.leaf_scores import TERMS, Pairs, leaf_features, sum_terms
+from mvseg.verification.leaf_scores import LEAF_TERMS, TERMS, Met, Pairs, sum_terms
 from mvseg.verification.numbers import ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -357,15 +357,17 @@ def test_clear_leaves_are_what_others_are_held_against() -> None:
     """Of three of which the views show 0.55, 0.75 and 0.85, the last two."""
     candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros(3), np.zeros(3, np.int64))
     best, sure = np.array([[0.55, 0.75, 0.85]] * 3), np.array([[0.2, 1.2, 1.6]] * 3)
-    features, clear = leaf_features(candidates, best, sure, share=np.ones((3, 3)), clear=None)
+    row = np.arange(9).reshape(3, 3)
+    met = Met(candidates, best, row, sure.ravel(), np.ones((3, 3)))
+    clear = met.find_clear(None)
     assert clear.score == pytest.approx(1.4)
-    np.testing.assert_allclose(features[:, 3], [-1.2, -0.2, 0.2], atol=1e-12)
+    np.testing.assert_allclose(LEAF_TERMS["detection score"](met, clear), [-1.2, -0.2, 0.2], atol=1e-12)
 
 
 def test_terms_are_rows_that_add_up() -> None:
     """In any order; a term that is left out leaves its rows out, and all others as they are."""
     rng, shape = np.random.default_rng(0), (6, 3)
-    evidence = Evidence(*(rng.random(shape) for _ in range(4)), share=rng.random((2, 3)))
+    evidence = Evidence(*(rng.random(shape) for _ in range(2)), share=rng.random((2, 3)))
     matched = np.where(rng.random(shape) < 0.5, rng.random(shape), np.nan)
     candidates = Candidates((None,) * 3, matched, np.zeros(3), np.zeros(3, np.int64))
     pairs = Pairs(candidates, evidence, rng.random(6))

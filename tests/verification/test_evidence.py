@@ -101,4 +101,4 @@ def test_columns_are_instance_ids() -> None:
     expected = see(draw_views(REGIONS, [LEAVES[1], LEAVES[2]], CAMERAS), len(REGIONS), np.array([True, True]))
     np.testing.assert_array_equal(both.visible[:, [4, 2]], expected.visible)
     np.testing.assert_array_equal(both.share[:, [4, 2]], expected.share)
-    assert not both.inside[:, [0, 1, 3, 5, 6]].any()
+    assert not both.visible[:, [0, 1, 3, 5, 6]].any()
