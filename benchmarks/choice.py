@@ -80,7 +80,7 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
     table, matched = found.proposals, found.matched
     rows = [masks.proposal for masks in matched]
     fit = Judges(scene.cameras).fit
-    candidates = gather_candidates(matched, rows, table=table, fit=fit, cameras=scene.cameras)
+    candidates = gather_candidates(matched, rows, table=table, fit=fit)
     drawn = draw_views(table.regions, candidates.surfaces, scene.cameras, photos=Photos(scene))
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]

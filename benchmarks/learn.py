@@ -5,7 +5,7 @@ area says); and after one round in which a person has outlined six leaves in two
 not right; these outlines do not count in the figures. The agreed area (`rate_pass`, in percent of all pixels) stands
 beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep:
 it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
-many are stems (`tube_evidence`), and E is the expected number of correct masks. Weights and detections are kept in
+many are stems (`stem_chances`), and E is the expected number of correct masks. Weights and detections are kept in
 --cache.
 """
 
@@ -40,7 +40,7 @@ from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.learn import GROWTH, learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
-from mvseg.reconstruction.stem.tube_evidence import tube_evidence
+from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.traits.filters import SURELY_STEM
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
@@ -93,8 +93,7 @@ def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
     chances = torch.tensor([0.0, *(plant.instances.probabilities[n] for n in range(1, masks.num_instances + 1))])
     expected = float((chances[masks.instance_ids.clamp(min=0)] * masks.match_scores).sum())
     of_mask = true_instances(masks.regions, truth, count_background=False)
-    tubes = tube_evidence(masks.regions, masks.instance_ids, opened.scene.cameras, surfaces=plant.instances.starts)
-    stems = [leaf for leaf, each in tubes.items() if each.probability > SURELY_STEM
+    stems = [leaf for leaf, chance in stem_chances(plant.instances.starts).items() if chance > SURELY_STEM
              and not bool((of_mask[masks.instance_ids == leaf] > 0).any())]  # fmt: skip
     area /= int(opened.scene.cameras.sizes.prod(1).sum())
     cells = (

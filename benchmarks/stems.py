@@ -1,4 +1,4 @@
-"""How good are nodes, and are stems told from leaves? `python benchmarks/stems.py --cache ~/mvseg-cells [--plants 6]`
+"""How good are nodes? `python benchmarks/stems.py --cache ~/mvseg-cells [--plants 6]`
 
 Simulated plants of 8 leaves with true ids, 480 x 480, 10 views on a 200 degree arc. Masks are exact, or have the faults
 of a segmenter (`faults.py`); no photos are used. By family and kind of masks: plants whose leaves agree about a stem;
@@ -7,9 +7,7 @@ lowest node that was found, and of divergence angles in degrees, in the true ord
 heights and azimuths; pairs of neighbours in the right order; plants whose phyllotaxis is right; processor time in that
 of the surfaces.
 
-`--evidence` gives stems masks, too, and prints how well each number of `TubeEvidence` tells them from leaves (area
-under the ROC curve: of all leaves, and of straps, ferns and lanceolate ones), and the weights of its probability,
-fitted to both kinds of masks. `--up` asks the stem which way is up, where only the photos say roughly so: plants that
+`--up` asks the stem which way is up, where only the photos say roughly so: plants that
 answer, median / 90th percentile and root mean square of degrees to the true up.
 """
 
@@ -24,22 +22,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.faults import Faults, degrade_labels
-from benchmarks.label_maps import KINDS, MIN_PIXELS, load_maps
-from mvseg.evaluation.truth import true_instances
+from benchmarks.label_maps import KINDS, load_maps
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
-from mvseg.reconstruction.stem.tube_evidence import tube_evidence
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.regions import regions_from_label_maps
-from mvseg.scene import Cameras
-from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
-from mvseg.simulation.growth import SimulatedPlant, grow_plant
-from mvseg.simulation.ray_cast import build_bvh, merge_meshes
-from mvseg.simulation.scene_writer import drop_small
+from mvseg.simulation.dataset import SceneSpec
+from mvseg.simulation.growth import grow_plant
 from mvseg.traits.nodes import measure_stem
 from mvseg.traits.stems import find_upward, up_of_stem
 from mvseg.traits.up import level_frame
@@ -48,8 +38,6 @@ NUM_LEAVES, NUM_VIEWS = 8, 10
 PHYLLOTAXIS = {
     "ovate": "decussate", "lanceolate": "spiral", "lobed": "spiral", "strap": "distichous", "leggy": "decussate"
 }  # fmt: skip
-NUMBERS = {"gain": 1, "width_change": -1, "relative_aspect": 1, "probability": 1}  # sign: of stems
-HARD = ("strap", "fern", "lanceolate")
 
 
 def measure_nodes(spec: SceneSpec, kind: str, cache: Path) -> dict[str, Any]:
@@ -138,79 +126,14 @@ def _spread(degrees: list[float]) -> str:
     return "{:.1f} / {:.1f} | {:.1f}".format(*np.quantile(shown, (0.5, 0.9)), np.sqrt((shown**2).mean()))
 
 
-def part_maps(plant: SimulatedPlant, cameras: Cameras) -> list[np.ndarray]:
-    """V label maps of leaves, and after them of the stems, without petioles."""
-    mesh, num = merge_meshes(plant), len(plant.leaves) + len(plant.stems)
-    faces = [len(leaf.faces) for leaf in plant.leaves] + [len(part.faces) for part in plant.parts]
-    owner = np.repeat(np.arange(1, len(faces) + 1), faces)
-    owner[owner > num] = 0
-    bvh, maps = build_bvh(mesh), []
-    for view, (width, height) in enumerate(cameras.sizes.tolist()):
-        v, u = np.mgrid[:height, :width] + 0.5
-        rays = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1) @ cameras.world_from_px[view].numpy().T
-        start = np.tile(cameras.centers[view].numpy().astype(np.float32), (len(rays), 1))
-        face = bvh.run(start, rays.astype(np.float32))
-        labels = np.where(face >= 0, owner[face], 0).reshape(height, width).astype(np.uint16)
-        maps.append(drop_small(labels, MIN_PIXELS))
-    return maps
-
-
-def collect_evidence(num_plants: int) -> list[dict[str, Any]]:
-    """A row per leaf and stem, and kind of masks."""
-    rows = []
-    for family in (*PHYLLOTAXIS, "fern"):
-        for seed in range(1, num_plants + 1):
-            spec = SceneSpec(f"stems/{family}_{seed}", "dev", family, NUM_LEAVES, NUM_VIEWS, seed)
-            plant = grow_plant(family, NUM_LEAVES, seed)
-            cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
-            true = part_maps(plant, cameras)
-            faulty = [degrade_labels(each, Faults(), seed=100 * seed + view) for view, each in enumerate(true)]
-            for kind, maps in zip(KINDS, (true, faulty), strict=True):
-                regions = regions_from_label_maps(maps)
-                ids = true_instances(regions, true, count_background=False)
-                ids = torch.where(ids > 0, ids, -1)
-                surfaces = fit_surfaces(regions, ids, cameras, is_rough=True)
-                for instance, found in tube_evidence(regions, ids, cameras, surfaces=surfaces).items():
-                    numbers = {name: getattr(found, name) for name in NUMBERS}
-                    about = {"family": family, "kind": kind, "is_stem": instance > NUM_LEAVES}
-                    rows.append({**about, **numbers, "features": found.features})
-    return rows
-
-
-def print_evidence(num_plants: int) -> None:
-    rows = collect_evidence(num_plants)
-    print("| masks | number | all leaves | straps, ferns, lanceolate | stems | leaves |")
-    for kind in KINDS:
-        for name, sign in NUMBERS.items():
-            known = [row for row in rows if row["kind"] == kind and np.isfinite(row[name])]
-            stems = np.array([sign * row[name] for row in known if row["is_stem"]])
-            leaves = [[sign * row[name] for row in known if not row["is_stem"] and row["family"] in of]
-                      for of in ((*PHYLLOTAXIS, "fern"), HARD)]  # fmt: skip
-            curve = [np.mean(stems[:, None] > np.array(each)) + np.mean(stems[:, None] == np.array(each)) / 2
-                     for each in leaves]  # fmt: skip
-            print(f"| {kind} | {name} | {curve[0]:.3f} | {curve[1]:.3f} | {len(stems)} | {len(leaves[0])} |")
-    features = np.array([row["features"] for row in rows if np.isfinite(row["gain"])])
-    is_stem = np.array([row["is_stem"] for row in rows if np.isfinite(row["gain"])])
-    side, spread = np.where(is_stem, 1, -1), features.std(0)
-
-    def loss(weights: np.ndarray) -> float:
-        misses = np.logaddexp(0, -side * (features @ weights))
-        return float(misses.sum() + 0.1 * ((weights * spread) ** 2).sum())
-
-    print("weights:", np.round(minimize(loss, np.zeros(features.shape[1])).x, 2).tolist())
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
     parser.add_argument("--plants", type=int, default=6, help="of each family")
-    parser.add_argument("--evidence", action="store_true", help="tell stems from leaves")
     parser.add_argument("--up", action="store_true", help="which way is up")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    if args.evidence:
-        print_evidence(args.plants)
-    elif args.up:
+    if args.up:
         print_up(args.cache, args.plants)
     else:
         print_nodes(args.cache, args.plants)

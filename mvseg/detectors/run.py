@@ -42,7 +42,8 @@ def run_heads(
         photo: (3, H, W) float32 in [0, 1], on the model's device.
         nms_thresh: IoU above which a box suppresses another; None for the model's own.
         detections_per_img: so many of the best scores are kept; None for the model's own.
-        num_growths: how often boxes grow where masks touch their sides, see `grow_boxes`.
+        num_growths: how often boxes grow where masks touch their sides, see `grow_boxes`; those that score less than
+            the model's threshold, once masks are cut, are gone then.
 
     Returns:
         The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
@@ -67,6 +68,8 @@ def run_heads(
         (detections,), _ = heads(features, proposals, resized.image_sizes)
         height, width = resized.image_sizes[0]
         for _ in range(num_growths):
+            is_good = decide_masks(detections)["scores"] >= heads.score_thresh
+            detections = {key: values[is_good] for key, values in detections.items()}
             boxes = grow_boxes(detections, (width, height))
             is_new = (boxes != detections["boxes"]).any(1)
             pooled = heads.mask_roi_pool(features, [boxes[is_new]], resized.image_sizes)

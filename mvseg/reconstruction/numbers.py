@@ -224,7 +224,8 @@ class TubeNumbers:
 
     mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
     # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.6, no stem less than 2.9.
-    least_aspect: float = 2.5  # chosen: min. length over width of a stem's surface, over the median of the plant
+    stem_aspect: float = 2.75  # chosen: length over width, over the median of the plant, that half of all stems exceed
+    aspect_sd: float = 0.025  # chosen: scale of its logarithm, at which a leaf becomes unlikely
     rows: int = 24  # limit: places along a tube at which it is compared with its masks
     patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
     num_steps: int = 12  # limit: steps of the fit
@@ -238,9 +239,7 @@ class TubeNumbers:
     taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
     beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
     least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
-    most_views: int = 12  # limit: views of a candidate that tell whether it is a stem
-    least_views: int = 3  # limit: views that show the width of a place, for its changes to count
-    width_noise_px: float = 1.0  # chosen: deviation of a width in pixels
+    most_views: int = 12  # limit: views of a stem that a tube is fitted to
 
 
 @dataclass(frozen=True)

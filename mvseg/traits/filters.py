@@ -13,7 +13,7 @@ from mvseg.traits.config import TraitsConfig
 # The first ones are the gravest.
 Kind = Literal["few_sure_views", "low_quality", "hardly_visible", "stem"]
 
-SURELY_STEM = 0.9  # chosen: probability from which an instance is a stem, see `TubeEvidence`
+SURELY_STEM = 0.9  # chosen: probability from which an instance is a stem, see `stem_chances`
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def find_rejected(
         return rejections
     for instance, chance in stems.items():
         if chance >= SURELY_STEM and instance not in rejections:
-            reason = f"looks like a stem: a tube explains its masks, probability {chance:.2f}"
+            reason = f"looks like a stem: it is slender for its plant, probability {chance:.2f}"
             rejections[instance] = Rejection("stem", reason)
     return dict(sorted(rejections.items()))
 

@@ -15,6 +15,7 @@ from mvseg.errors import check_arguments
 from mvseg.formats.photos import Photos
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
+from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
@@ -25,7 +26,7 @@ from mvseg.traits.leaf import NEED_UP, Measurement, measure_leaf, measure_voxels
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import find_stems, find_tubes, tubes_of_masks, up_of_stem
+from mvseg.traits.stems import find_stems, fit_tubes, join_tubes, up_of_stem
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
@@ -168,21 +169,21 @@ def measure_plant(
     photos = photos or Photos(scene)
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: numbers["visible_share"].value for instance, numbers in appearance.items()}
-    tubes = find_tubes(surfaces or {}, masks, scene.cameras, stems=stems, is_asked=config.leaves_only)
+    chances = {instance: chance for instance, chance in stem_chances(surfaces or {}).items() if instance not in stems}
     rejected = find_rejected(
         every,
         config=config,
         sure_views=sure_views,
         visible_shares=visible,
-        stems={instance: each.probability for instance, each in tubes.items() if instance not in stems},
+        stems=chances,
     )
     rejected |= {instance: Rejection("stem", "its masks are of the category of stems") for instance in stems}
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     plant_stems: tuple[Stem, ...] = ()
     if config.stems == "auto":
-        ids = [instance for instance in tubes if instance in rejected and rejected[instance].kind == "stem"]
-        seen = tubes_of_masks(ids, {instance: each.tube for instance, each in tubes.items()}, masks, scene.cameras)
-        plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=seen)
+        ids = [instance for instance, each in rejected.items() if each.kind == "stem"]
+        tubes = join_tubes(fit_tubes(ids, surfaces or {}, masks, scene.cameras), masks, scene.cameras)
+        plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=tubes)
     tilt_deg = 0.0
     if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
         frame, tilt_deg = level_frame(up), TILT_DEG

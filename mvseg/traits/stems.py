@@ -16,7 +16,7 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.reconstruction.numbers import AXES, TUBE
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube
+from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube, midrib_of
 from mvseg.reconstruction.stem.leaf_bases import (
     BaseAxis,
     LeafBases,
@@ -29,9 +29,9 @@ from mvseg.reconstruction.stem.leaf_bases import (
 from mvseg.reconstruction.stem.stem_path import StemPath, find_path
 from mvseg.reconstruction.stem.thin_parts import ThinCells, ThinView, find_cells, see_thin, share_of_views
 from mvseg.reconstruction.stem.tube import Tube
-from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
 from mvseg.reconstruction.surface.fit_surfaces import instance_frames, stack_instance
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
 from mvseg.scene import Cameras
 from mvseg.traits.nodes import Stem, measure_stem
 
@@ -49,19 +49,6 @@ PARALLEL_DEG = 45.0  # chosen: max. bend where two masks of one stem join
 JOINT = 2.0  # chosen: max. gap there, in diameters
 WIDER = 3.0  # chosen: width of an end of a stem, in its usual width, from which the mask holds the pot, too
 LEAST_STEM = 1.0  # chosen: length of a stem that shows up, in leaves; shorter ones of seedlings lean by 20 degrees
-
-
-def find_tubes(
-    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, stems: Collection[int], is_asked: bool
-) -> dict[int, TubeEvidence]:
-    """Evidence by instance id: of `stems`, as the user says, and, if `is_asked`, of others slender enough to be one."""
-    regions, ids = masks.regions, masks.instance_ids
-    known = {instance: surface for instance, surface in surfaces.items() if instance in stems}
-    others = {instance: surface for instance, surface in surfaces.items() if instance not in stems}
-    found = tube_evidence(regions, ids, cameras, surfaces=known)
-    if is_asked:
-        found |= tube_evidence(regions, ids, cameras, surfaces=others, least_aspect=TUBE.least_aspect)
-    return found
 
 
 def find_stems(
@@ -82,7 +69,7 @@ def find_stems(
     Args:
         surfaces: {instance id: credible surface} of leaves.
         frame: (3, 3) rows east, north, up; None: up is not known.
-        tubes: fitted to masks of stems, see `tubes_of_masks`.
+        tubes: fitted to masks of stems, see `join_tubes`.
     """
     if not surfaces:
         return ()
@@ -170,14 +157,32 @@ class StemTube:
     knows_foot: bool
 
 
-def tubes_of_masks(
-    stems: Collection[int], tubes: Mapping[int, Tube], masks: Masks, cameras: Cameras
-) -> tuple[StemTube, ...]:
-    """Select the tubes of instances that are stems, from those of all, by id. Masks that were drawn for each internode
-    are one stem: those of which an end meets another one's are fitted together. Warns (InputWarning) of masks that hold
-    the pot, too: the foot of such a stem is not known."""
+def fit_tubes(
+    stems: Collection[int], surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras
+) -> dict[int, Tube]:
+    """{instance id: tube} of those stems, by id, whose masks show one in two views or more."""
+    regions, ids, cameras, tubes = masks.regions.to("cpu"), masks.instance_ids.cpu(), cameras.to("cpu"), {}
+    frames = instance_frames(regions, ids, cameras) if stems else []
+    offsets = [each.offsets_px[each.offsets_px.isfinite()].numpy() for each in surfaces.values() if each.exists]
+    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
+    for stem in sorted(stems):
+        members = regions.select((ids == stem) & (regions.areas > 0))
+        views = members.view_index.unique()
+        if stem in surfaces and surfaces[stem].exists and len(views) > 1:
+            chosen = views[spread_views(cameras[views], TUBE.most_views)]
+            members = members.select(torch.isin(members.view_index, chosen))
+            stack = stack_instance(members, cameras, frames, instance=stem)
+            start = midrib_of(surfaces[stem].coefficients.numpy())
+            tubes[stem] = fit_tube(stack, start, mask_sd_px=0.0 if errors is None else errors.sd_px)
+    return {stem: tube for stem, tube in tubes.items() if tube.exists}
+
+
+def join_tubes(tubes: Mapping[int, Tube], masks: Masks, cameras: Cameras) -> tuple[StemTube, ...]:
+    """Join the tubes of stems, by instance id. Masks that were drawn for each internode are one stem: those of which an
+    end meets another one's are fitted together. Warns (InputWarning) of masks that hold the pot, too: the foot of such
+    a stem is not known."""
     regions, cameras, joined = masks.regions.to("cpu"), cameras.to("cpu"), []
-    for ids in _join_ends({stem: tubes[stem] for stem in sorted(stems) if tubes[stem].exists}):
+    for ids in _join_ends(tubes):
         of_stem = torch.isin(masks.instance_ids.cpu(), torch.tensor(ids)) & (regions.areas > 0)
         whole = torch.where(of_stem, ids[0], masks.instance_ids.cpu())
         members = regions.select(of_stem)

@@ -12,11 +12,8 @@ from torch import Tensor
 
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.masks import Masks
-from mvseg.reconstruction.numbers import TUBE
-from mvseg.reconstruction.stem.tube_evidence import tube_evidence
+from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import Regions
-from mvseg.scene import Cameras
 from mvseg.verification.numbers import CHOICE
 
 Fit = Callable[[Masks], Mapping[int, LeafSurface]]
@@ -30,8 +27,7 @@ class Candidates:
     Attributes:
         surfaces: K, None where the masks of one agree on none.
         matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
-        stem: (K,) probability that it is a stem, see `TubeEvidence`; 0 where no tube was tried (no surface, or not
-            slender).
+        stem: (K,) probability that it is a stem, see `stem_chances`; 0 without a surface.
         source: (K,) int64, number of the matching that it comes from.
     """
 
@@ -93,7 +89,6 @@ def gather_candidates(
     *,
     table: Masks,
     fit: Fit | None,
-    cameras: Cameras,
 ) -> Candidates:
     """The instances of each matching; those that an earlier one has, too, once.
 
@@ -123,27 +118,9 @@ def gather_candidates(
             source.append(number)
     if not columns:
         return Candidates((), np.zeros((len(table), 0)), np.zeros(0), np.zeros(0, np.int64))
-    stem = _stem_chances(shapes, members, table.regions, cameras)
+    chances = stem_chances({number: each for number, each in enumerate(shapes) if each is not None})
+    stem = np.array([chances.get(number, 0.0) for number in range(len(shapes))])
     return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), stem, np.array(source))
-
-
-def _stem_chances(
-    surfaces: Sequence[LeafSurface | None], members: Sequence[Tensor], regions: Regions, cameras: Cameras
-) -> Floats:
-    stem = np.zeros(len(surfaces))
-    if not any(each is not None for each in surfaces):
-        return stem
-    ids = torch.cat([torch.full((len(rows),), number) for number, rows in enumerate(members, start=1)])
-    tubes = tube_evidence(
-        regions.select(torch.cat(list(members))),
-        ids,
-        cameras,
-        surfaces={number: each for number, each in enumerate(surfaces, start=1) if each is not None},
-        least_aspect=TUBE.least_aspect,
-    )
-    for number, evidence in tubes.items():
-        stem[number - 1] = evidence.probability
-    return stem
 
 
 def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:

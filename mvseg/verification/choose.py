@@ -152,7 +152,7 @@ def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | N
     if not judges.has_surfaces or not matched.num_instances:
         return None
     rows, cameras = [matched.proposal], judges.cameras
-    candidates = gather_candidates([matched], rows, table=matched, fit=judges.fit, cameras=cameras)
+    candidates = gather_candidates([matched], rows, table=matched, fit=judges.fit)
     drawn, own = draw_views(matched.regions, candidates.surfaces, cameras), candidates.of_rows(0)
     evidence, scores = see(drawn, len(matched), candidates.is_credible), np.full(len(matched), CHOICE.given)
     q = show_chances(Pairs(candidates, evidence, scores))
@@ -194,7 +194,7 @@ def choose_leaves(
     if edited is not None:  # first, so that what edits say of a leaf is not the same as what was there before
         tables, rows = [edited.concerned(), *tables], [row_of, *rows]
     fit = judges.fit if is_judged else None
-    candidates = gather_candidates(tables, rows, table=table, fit=fit, cameras=judges.cameras)
+    candidates = gather_candidates(tables, rows, table=table, fit=fit)
     views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
     if judges.holds:

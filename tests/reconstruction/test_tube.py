@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks
+from blade_scene import SIZE
+from known_leaves import flat_leaf
 from mvseg.reconstruction.stem.fit_tube import apparent_widths, fit_tube, see_tube, tube_distances
+from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.reconstruction.stem.tube import Tube, axis_slopes, fit_axis, sweep_circle
-from mvseg.reconstruction.stem.tube_evidence import TubeEvidence, tube_evidence
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_patch import spline_basis
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from reference import nearest_edge_reference
@@ -131,30 +131,6 @@ def test_jacobian_is_the_change_of_the_outline() -> None:
     assert np.median(moved / told) == pytest.approx(1, abs=0.1)
 
 
-def evidence_of(masks: list[np.ndarray]) -> TubeEvidence:
-    regions, ids = as_regions(masks)
-    surfaces = fit_surfaces(regions, ids, CAMERAS, is_rough=True)
-    return tube_evidence(regions, ids, CAMERAS, surfaces=surfaces)[1]
-
-
-@pytest.mark.parametrize("half_width", [0.45, 0.1, 0.06])
-def test_a_leaf_changes_its_width_and_a_stem_does_not(half_width: float) -> None:
-    """Straps, too, whose aspect is that of a stem."""
-    leaf = evidence_of(blade_masks(EllipticBlade(half_width=half_width, bend=0.9), CAMERAS))
-    stem = evidence_of(tube_masks(BENT, 0.06 + 0 * T))
-    assert stem.width_change < 0.1 < leaf.width_change
-    assert leaf.gain < stem.gain
-    assert leaf.probability < 0.1 < 0.5 < stem.probability
-
-
-def test_evidence_needs_a_surface_and_two_views() -> None:
-    regions, ids = as_regions(blade_masks(EllipticBlade(), CAMERAS))
-    surfaces = fit_surfaces(regions, ids, CAMERAS, is_rough=True)
-    assert tube_evidence(regions, ids, CAMERAS, surfaces={}) == {}
-    one = regions.view_index == 0
-    assert tube_evidence(regions.select(one), ids[one], CAMERAS, surfaces=surfaces) == {}
-
-
 def test_widths_are_not_measured_where_another_instance_is() -> None:
     masks = tube_masks(STRAIGHT, 0.06 + 0 * T)
     others = [np.zeros((SIZE, SIZE), np.int32) for _ in masks]
@@ -170,3 +146,17 @@ def test_mesh_is_closed_and_as_large_as_the_tube() -> None:
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(np.pi * 0.06**2 * 2, rel=0.06)
     assert fit_tube(stack(tube_masks(*SHAPES["bent"]))).mesh().is_watertight
+
+
+def test_stems_are_slender_for_their_plant() -> None:
+    """In any world; where all leaves are as slender, there are none."""
+    leaves = {number: flat_leaf(length=40.0, half_width=width) for number, width in enumerate((10, 9, 8, 2), start=1)}
+    chances = stem_chances(leaves)
+    assert chances[4] > 0.99
+    assert max(chances[number] for number in (1, 2, 3)) < 1e-6
+    small = {
+        number: flat_leaf(length=4.0, half_width=width) for number, width in enumerate((1, 0.9, 0.8, 0.2), start=1)
+    }
+    assert stem_chances(small) == pytest.approx(chances, abs=1e-6)
+    assert max(stem_chances({number: flat_leaf(length=40.0, half_width=2.0) for number in (1, 2)}).values()) < 1e-6
+    assert stem_chances({}) == {}

@@ -25,11 +25,11 @@ def test_leaves_are_leaves() -> None:
         assert find_rejected(shapes, config=CONFIG) == {}
 
 
-def test_what_a_tube_explains_is_a_stem_unless_all_instances_are_wanted() -> None:
+def test_what_is_slender_is_a_stem_unless_all_instances_are_wanted() -> None:
     shapes, chances = plant(), {1: 0.95, 2: 0.85, 3: 0.02, 7: 0.99}  # 7 has no shape
     found = find_rejected(shapes, config=CONFIG, stems=chances)
     assert {i: rejection.kind for i, rejection in found.items()} == {1: "stem", 7: "stem"}
-    assert found[1].reason == "looks like a stem: a tube explains its masks, probability 0.95"
+    assert found[1].reason == "looks like a stem: it is slender for its plant, probability 0.95"
     assert find_rejected(shapes, config=TraitsConfig(leaves_only=False), stems=chances) == {}
 
 

@@ -21,7 +21,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import regions_from_label_maps
 from mvseg.traits.measure import Traits
 from mvseg.traits.nodes import Stem
-from mvseg.traits.stems import StemTube, find_stems, tubes_of_masks, up_of_stem
+from mvseg.traits.stems import StemTube, find_stems, join_tubes, up_of_stem
 from mvseg.traits.table import read_nodes, write_nodes
 from mvseg.traits.up import level_frame
 from tube_scene import BENT, T, stack, tube_masks
@@ -229,9 +229,9 @@ def test_masks_of_internodes_are_one_stem_and_a_pot_is_no_foot(case: str) -> Non
     tubes = {number: fit_tube(stack(each, cameras)) for number, each in enumerate(drawn, start=1)}
     if case == "pot":
         with warns_of("stem_with_pot"):
-            (joined,) = tubes_of_masks(tubes, tubes, masks, cameras)
+            (joined,) = join_tubes(tubes, masks, cameras)
     else:
-        (joined,) = tubes_of_masks(tubes, tubes, masks, cameras)
+        (joined,) = join_tubes(tubes, masks, cameras)
         length = float(np.linalg.norm(np.diff(BENT, axis=0), axis=1).sum())
         assert joined.tube.length == pytest.approx(length, rel=0.06)
     assert joined.knows_foot == (case != "pot")
