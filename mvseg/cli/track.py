@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
@@ -112,9 +113,10 @@ def _name_plant(results: Sequence[Path]) -> str:
     """Common beginning of the names of all results, without a date; that of their scenes where it is short."""
     from mvseg.results.run_record import load_run
 
-    for names in ([path.resolve().name for path in results], [Path(load_run(path).scene).name for path in results]):
-        shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
-        name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")
-        if len(name) >= LEAST_NAME:
-            return name
+    with suppress(InputError):  # no results: whoever reads them says so
+        for names in ([path.resolve().name for path in results], [Path(load_run(path).scene).name for path in results]):
+            shared = takewhile(lambda letters: len(set(letters)) == 1, zip(*names, strict=False))
+            name = "".join(letters[0] for letters in shared).rstrip("0123456789-_. ")
+            if len(name) >= LEAST_NAME:
+                return name
     return ""

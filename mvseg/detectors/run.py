@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 from torchvision.models.detection.roi_heads import maskrcnn_inference, paste_masks_in_image
 from torchvision.models.detection.transform import GeneralizedRCNNTransform, resize_boxes
-from torchvision.ops import batched_nms
+from torchvision.ops import batched_nms, clip_boxes_to_image
 
 from mvseg.detectors.mask_cut import CUT, decide_masks
 
@@ -90,7 +90,7 @@ def grow_boxes(detections: dict[str, Tensor], size: tuple[int, int]) -> Tensor:
     boxes, (width, height) = detections["boxes"], size
     spans = boxes[:, 2:] - boxes[:, :2]
     grown = boxes + GROWTH * torch.cat((-spans, spans), 1) * (sides > GROWTH)
-    return torch.minimum(grown.clamp(min=0), grown.new_tensor([width, height, width, height]))
+    return clip_boxes_to_image(grown, (height, width))
 
 
 def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:
