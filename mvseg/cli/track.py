@@ -46,6 +46,7 @@ def add_options(parser: ArgumentParser) -> None:
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.batch.track_plants import track_plants  # keeps --help quick
+    from mvseg.tracking.page import PAGE_FILE
 
     num_workers = read_workers(args)
     asked = _read_again(args) if args.again is not None else _read_results(args)
@@ -70,8 +71,8 @@ def run(args: Namespace) -> int:
     span = f"{longest:.3g} {'day' if longest == 1 else 'days'} apart{' at most' if num_dates > 2 else ''}"
     what = f"{num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'}"
     say(f"{asked.folder}: {what} on {num_dates} dates, {span}")
-    if args.report and len(tracked) == 1 and not failed:
-        say(f"Look: {asked.folder / 'tracks.html'}")
+    if args.report and done:
+        say(f"mvseg: look at: {asked.folder / PAGE_FILE}")
     return SOME_FAILED if failed else 0
 
 

@@ -33,7 +33,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
        0.7): an excessive set of masks. Each mask is cut where its expected IoU is largest, and its score multiplied by
        that (`detectors/mask_cut.py`); what then scores less than the detector's `roi_heads.score_thresh` is
-       discarded.
+       discarded. Boxes whose masks touch their sides grow, and are masked again (`grow_boxes`).
     2. Match first: what plain NMS at `cluster_iou` keeps of it is matched across views. Objects of different
        classes are never matched.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the id of the instance whose epipolar map

@@ -27,7 +27,7 @@ class DetectionNumbers:
     more_score: float = 0.1  # chosen: min. score of proposals that are matched for more candidates
     least_score: float = 0.05  # definition: min. score of the whole excessive set: torchvision's threshold
     most_proposals: int = 200  # limit: proposals of a view, the best ones; a fern has up to 190
-    num_growths: int = 2  # limit: how often boxes of proposals grow where their masks touch them, see `grow_boxes`
+    num_growths: int = 2  # chosen: how often boxes of proposals grow where their masks touch them, see `grow_boxes`
     mask_pixels: int = 1024  # limit: max. pixels of a proposal's mask that send out epipolar lines
     band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
     plant_views: int = 3  # chosen: min. views of an instance that is part of the plant; all where there are fewer

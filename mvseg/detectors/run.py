@@ -68,9 +68,10 @@ def run_heads(
         (detections,), _ = heads(features, proposals, resized.image_sizes)
         height, width = resized.image_sizes[0]
         for _ in range(num_growths):
-            is_good = decide_masks(detections)["scores"] >= heads.score_thresh
+            decided = decide_masks(detections)
+            is_good = decided["scores"] >= heads.score_thresh
             detections = {key: values[is_good] for key, values in detections.items()}
-            boxes = grow_boxes(detections, (width, height))
+            boxes = grow_boxes(detections["boxes"], decided["masks"][is_good], (width, height))
             is_new = (boxes != detections["boxes"]).any(1)
             pooled = heads.mask_roi_pool(features, [boxes[is_new]], resized.image_sizes)
             (masks,) = maskrcnn_inference(heads.mask_predictor(heads.mask_head(pooled)), [detections["labels"][is_new]])
@@ -82,15 +83,20 @@ def run_heads(
     return decide_masks(detections | floats) | {"frame": torch.tensor([width, height])}
 
 
-def grow_boxes(detections: dict[str, Tensor], size: tuple[int, int]) -> Tensor:
-    """(D, 4) xyxy boxes whose sides move out where masks touch them, within the frame (`size`: width, height). A mask
-    ends at its box; one that is cut off there shows the rest in a larger one."""
-    inside = (decide_masks(detections)["masks"][:, 0] > CUT).float()
+def grow_boxes(boxes: Tensor, masks: Tensor, size: tuple[int, int]) -> Tensor:
+    """(D, 4) boxes whose sides move out where masks touch them. A mask ends at its box; one that is cut off there shows
+    the rest in a larger one.
+
+    Args:
+        boxes: (D, 4) float xyxy, pixels of the frame.
+        masks: (D, 1, S, S) probabilities in the frame of the boxes, to be cut at 0.5.
+        size: width and height of the frame, which no box leaves.
+    """
+    inside = (masks[:, 0] > CUT).float()
     sides = torch.stack([inside[:, :, 0], inside[:, 0], inside[:, :, -1], inside[:, -1]], 1).mean(2)
-    boxes, (width, height) = detections["boxes"], size
     spans = boxes[:, 2:] - boxes[:, :2]
     grown = boxes + GROWTH * torch.cat((-spans, spans), 1) * (sides > GROWTH)
-    return clip_boxes_to_image(grown, (height, width))
+    return clip_boxes_to_image(grown, size[::-1])
 
 
 def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:

@@ -224,8 +224,8 @@ class TubeNumbers:
 
     mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
     # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.6, no stem less than 2.9.
-    stem_aspect: float = 2.75  # chosen: length over width, over the median of the plant, that half of all stems exceed
-    aspect_sd: float = 0.025  # chosen: scale of its logarithm, at which a leaf becomes unlikely
+    stem_aspect: float = 2.75  # chosen: length over width, in the median of the plant, where stems begin
+    aspect_scale: float = 0.025  # chosen: logistic scale of its logarithm around that
     rows: int = 24  # limit: places along a tube at which it is compared with its masks
     patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
     num_steps: int = 12  # limit: steps of the fit

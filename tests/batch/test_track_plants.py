@@ -17,6 +17,7 @@ from benchmarks.tracking import true_ids
 from mvseg import demo_scene
 from mvseg.batch.track_plants import list_plants, track_plants
 from mvseg.cli import main
+from mvseg.cli.track import _name_plant
 from mvseg.errors import InputError
 from mvseg.formats.json_file import read_json
 from mvseg.formats.label_png import read_labels, write_label_png
@@ -216,6 +217,13 @@ def test_the_growth_model_of_the_docs(
     page = (Path(__file__).parents[2] / "docs" / "tracking.md").read_text(encoding="utf-8")
     (model,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     monkeypatch.chdir(tmp_path)
-    capsys.readouterr()
+    assert capsys.readouterr().out.endswith(f"mvseg: look at: {tmp_path / 'tracks' / 'tracks.html'}\n")
     exec(model, {})
     assert len(re.findall(r"^tracks \d+ \[", capsys.readouterr().out, re.MULTILINE)) == 7
+
+
+def test_a_plant_has_the_name_of_its_scenes_where_results_are_named_after_dates(tmp_path: Path) -> None:
+    for day, scene in (("day-0", "demo_plant"), ("day-6", "demo_plant_later")):
+        (tmp_path / day).mkdir()
+        (tmp_path / day / "run.json").write_text(json.dumps({"format": 2, "scene": f"/plants/{scene}"}), "utf-8")
+    assert _name_plant([tmp_path / "day-0", tmp_path / "day-6"]) == "demo_plant"

@@ -371,12 +371,18 @@ def test_terms_are_rows_that_add_up() -> None:
     matched = np.where(rng.random(shape) < 0.5, rng.random(shape), np.nan)
     candidates = Candidates((None,) * 3, matched, np.zeros(3), np.zeros(3, np.int64))
     pairs = Pairs(candidates, evidence, rng.random(6))
-    weights = dict(zip(TERMS, rng.normal(size=len(TERMS)), strict=True))
-    whole = sum_terms(weights, pairs)
-    np.testing.assert_array_equal(whole, sum_terms(dict(reversed(weights.items())), pairs))
-    for name, weight in weights.items():
-        others = {other: value for other, value in weights.items() if other != name}
-        np.testing.assert_allclose(whole - sum_terms(others, pairs), weight * TERMS[name](pairs), atol=1e-9)
+    met = Met(candidates, rng.random((2, 3)), rng.integers(0, 6, (2, 3)), rng.normal(size=6), rng.random((2, 3)))
+    clear = met.find_clear(None)
+    for terms in (
+        {name: term(pairs) for name, term in TERMS.items()},
+        {name: term(met, clear) for name, term in LEAF_TERMS.items()},
+    ):
+        weights = dict(zip(terms, rng.normal(size=len(terms)), strict=True))
+        whole = sum_terms(weights, terms)
+        np.testing.assert_array_equal(whole, sum_terms(dict(reversed(weights.items())), terms))
+        for name, weight in weights.items():
+            others = {other: value for other, value in weights.items() if other != name}
+            np.testing.assert_allclose(whole - sum_terms(others, terms), weight * terms[name], atol=1e-9)
 
 
 def test_nothing_is_an_answer() -> None:

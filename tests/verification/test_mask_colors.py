@@ -53,22 +53,16 @@ def test_the_same_as_pixel_by_pixel() -> None:
     alike = [np.median([np.sqrt(shares[k] * shares[j]).sum() for j in others[k]]) for k in range(4)]
     expected = np.log(alike) - np.median(np.log(alike)[is_clear])
     np.testing.assert_allclose(counted.likeness(weights, is_clear), expected, atol=1e-9)
-    order = [2, 0, 3, 1]
-    np.testing.assert_allclose(counted.likeness(weights[:, order], is_clear[order]), expected[order], atol=1e-9)
+    np.testing.assert_allclose(counted.likeness(weights[:, ::-1], is_clear[::-1]), expected[::-1], atol=1e-9)
     assert not counted.likeness(weights, np.arange(4) == 1).any()
-
-
-def test_without_photos_there_are_no_colors() -> None:
-    assert MaskColors.of(draw_views(REGIONS, (), CAMERAS)) is None
-    assert MaskColors.of(()) is None
+    assert MaskColors.of(draw_views(REGIONS, (), CAMERAS)) is MaskColors.of(()) is None
 
 
 def test_what_has_other_colors_than_clear_leaves_is_less_likely_a_leaf(monkeypatch: pytest.MonkeyPatch) -> None:
     """A red leaf among green ones, even if it is clear otherwise; in the shade it stays one, and all may be red."""
     monkeypatch.setattr("mvseg.verification.choose.fit_roughly", lambda *_: LEAVES)
     masks = Masks.of(REGIONS, detection_scores=torch.where(IDS == 3, 0.5, 0.9), origin=Origin.DETECTED)
-    sure = torch.full((len(IDS),), 0.9)
-    masks = replace(masks, instance_ids=IDS, match_scores=sure, proposal=torch.arange(len(IDS)))
+    masks = replace(masks, instance_ids=IDS, match_scores=0.9 + 0 * IDS, proposal=torch.arange(len(IDS)))
 
     def chance(*colors: int) -> float:
         judges = Judges(CAMERAS, photos=lambda view: paint(view, dict(enumerate(colors, 1))), min_probability=0.0)
@@ -77,6 +71,5 @@ def test_what_has_other_colors_than_clear_leaves_is_less_likely_a_leaf(monkeypat
         return leaves.probabilities[int(ids[IDS[proposal] == 3].mode().values)]
 
     assert chance(3, 3, 3) == pytest.approx(chance(1, 1, 1), abs=1e-6)
-    assert chance(1, 1, 1) > 0.5
-    assert chance(1, 1, 2) > 0.5
+    assert min(chance(1, 1, 1), chance(1, 1, 2)) > 0.5
     assert chance(1, 1, 3) < 0.1
