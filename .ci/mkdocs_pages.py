@@ -39,8 +39,11 @@ ORDER = {
     "Notes": (
         "notes/matching.md",
         "notes/surfaces.md",
+        "notes/traits.md",
         "notes/detector.md",
         "notes/check.md",
+        "notes/pose.md",
+        "notes/corrections.md",
         "notes/tracking.md",
         "notes/performance.md",
     ),
