@@ -49,7 +49,7 @@ def measure_nodes(spec: SceneSpec, kind: str, cache: Path) -> dict[str, Any]:
     fitted = time.process_time()
     blades = {leaf: surface for leaf, surface in surfaces.items() if surface.is_credible}
     up = np.array([0.0, 0.0, 1.0])
-    stems = [measure_stem(axis.tube, axis.bases.select(axis.is_near), frame=level_frame(up), source="leaf bases")
+    stems = [measure_stem(axis.axis, axis.bases.select(axis.is_near), frame=level_frame(up), source="leaf bases")
              for axis in axes_of_bases(blades, up)]  # fmt: skip
     share = (time.process_time() - fitted) / (fitted - start)
     tall = np.ptp(np.concatenate([*(leaf.vertices for leaf in plant.leaves), *plant.stems])[:, 2])
@@ -60,11 +60,11 @@ def measure_nodes(spec: SceneSpec, kind: str, cache: Path) -> dict[str, Any]:
         petioles = [plant.petioles[node.leaf - 1] for node in stem.nodes]
         height = np.array([each[0, 2] for each in petioles])
         azimuth = np.degrees([np.arctan2(*(each[1] - each[0])[[1, 0]]) for each in petioles])
-        measured = np.array([node.azimuth.value for node in stem.nodes])
+        measured = np.array([node.node_azimuth.value for node in stem.nodes])
         for node, true, turned in zip(stem.nodes[1:], height[1:] - height[0], azimuth[1:], strict=True):
-            apart = (node.azimuth.value - turned + 180) % 360 - 180
+            apart = (node.node_azimuth.value - turned + 180) % 360 - 180
             height_error, height_sd = (100 * each / tall for each in (node.height.value - true, node.height.sd))
-            errors.append((height_error, height_sd, apart, node.azimuth.sd))
+            errors.append((height_error, height_sd, apart, node.node_azimuth.sd))
         steps = [np.abs((np.diff(each) + 180) % 360 - 180) for each in (measured, azimuth)]
         divergence += np.abs(steps[0] - steps[1]).tolist()
         ordered += (np.diff(height) > -0.01 * tall).tolist()
@@ -112,7 +112,7 @@ def print_up(cache: Path, num_plants: int) -> None:
             regions, ids = scene.masks(kind)
             surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras)
             blades = {leaf: surface for leaf, surface in surfaces.items() if surface.is_credible}
-            stems = [measure_stem(axis.tube, axis.bases.select(axis.is_near), frame=None, source="leaf bases")
+            stems = [measure_stem(axis.axis, axis.bases.select(axis.is_near), frame=None, source="leaf bases")
                      for axis in axes_of_bases(blades, find_upward(scene.cameras))]  # fmt: skip
             up = up_of_stem(stems, blades, scene.cameras)
             found += [] if up is None else [float(np.degrees(np.arccos(np.clip(up[2], -1, 1))))]

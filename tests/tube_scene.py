@@ -7,13 +7,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from blade_scene import SIZE, ring_cameras
-from mvseg.reconstruction.stem.tube import sweep_circle
-from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
+from mvseg.reconstruction.stem.stem_axis import sweep_circle
 from mvseg.scene import Cameras
 
 CAMERAS = ring_cameras(10)
 T = np.linspace(0, 1, 60)
-STRAIGHT = np.stack([0 * T, 0 * T, 2 * T - 1], 1)
 BENT = np.stack([0.5 * np.sin(1.5 * T), 0.2 * T, 1.8 * T - 1], 1)
 
 
@@ -30,9 +28,3 @@ def tube_masks(points: np.ndarray, radius: np.ndarray, cameras: Cameras = CAMERA
         face = bvh.run(np.tile(center.astype(np.float32), (len(rays), 1)), rays)
         masks.append((face >= 0).reshape(SIZE, SIZE))
     return masks
-
-
-def stack(masks: list[np.ndarray], cameras: Cameras = CAMERAS, others: list[np.ndarray] | None = None) -> MaskStack:
-    """The masks as a fit takes them; `others` are V frames of instances that may hide the tube."""
-    nothing = [np.zeros((SIZE, SIZE), np.int32)] * len(masks)
-    return stack_masks(masks, others or nothing, range(len(masks)), px_from_world=cameras.px_from_world.numpy())

@@ -211,35 +211,15 @@ class ErrorNumbers:
 
 @dataclass(frozen=True)
 class StemNumbers:
-    """Numbers that tell the base of a leaf from its tip."""
+    """Numbers that tell the base of a leaf from its tip, and stems from leaves."""
 
     least_leaves: int = 4  # limit: leaves from which the stem is looked for
     clear: float = 0.25  # chosen: share of the length by which the base is nearer to the stem than the tip, to be sure
     rounds: int = 5  # limit: rounds of fitting the stem to the bases
-
-
-@dataclass(frozen=True)
-class TubeNumbers:
-    """Tubes that are fitted to masks of stems, and what tells stems from leaves."""
-
-    mesh: tuple[int, int] = (32, 12)  # definition: places along a tube that is measured or drawn, and its sides
+    sides: int = 12  # definition: of a stem that is drawn
     # Of 27 plants (basils, muskmelons, `benchmarks/unruly_plants.py`) no leaf had more than 2.6, no stem less than 2.9.
     stem_aspect: float = 2.75  # chosen: length over width, in the median of the plant, where stems begin
     aspect_scale: float = 0.025  # chosen: logistic scale of its logarithm around that
-    rows: int = 24  # limit: places along a tube at which it is compared with its masks
-    patch_grid: tuple[int, int] = (16, 3)  # limit: rows and columns of a patch whose midrib a fit starts from
-    num_steps: int = 12  # limit: steps of the fit
-    far_steps: int = 8  # limit: of these, until edges are looked for nearby only
-    end_weight: float = 4.0  # chosen: weight of an end, in that of a sample of a side: there is one of it
-    shorten: float = 0.25  # chosen: weight of a mask that ends before the tube, where that of a longer one is 1
-    damping: float = 0.01  # limit: of a step, as a share of the diagonal
-    most_step: float = 0.1  # limit: max. way of a coefficient in a step, in lengths of the tube
-    least_radius: float = 0.05  # limit: min. radius after a step, in the mean one before it
-    bend_sd: float = 0.03  # chosen: deviation of third differences of the axis, in lengths
-    taper_sd: float = 0.5  # chosen: deviation of differences of the radius, in mean radii
-    beside_px: float = 2.0  # chosen: distance beside a mask within which another one may hide a part of its width
-    least_sine: float = 0.5  # chosen: sine of the angle between axis and line of sight, for a width to count
-    most_views: int = 12  # limit: views of a stem that a tube is fitted to
 
 
 @dataclass(frozen=True)
@@ -323,6 +303,5 @@ SEARCH = SearchNumbers()
 DOUBTS = QualityNumbers()
 ERRORS = ErrorNumbers()
 STEM = StemNumbers()
-TUBE = TubeNumbers()
 AXES = AxisNumbers()
 THIN = ThinNumbers()

@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.stem.tube import sweep_circle
+from mvseg.reconstruction.stem.stem_axis import sweep_circle
 from mvseg.traits.nodes import Stem
 
 STEM_COLOR, PETIOLE_COLOR = (126, 104, 66), (170, 176, 120)  # definition: of stems, and of petioles, which are guessed
@@ -39,12 +39,10 @@ class StemPart:
 
 
 def stem_parts(stem: Stem) -> Iterator[StemPart]:
-    """The tube of a stem, and thin straight ones from its nodes to the blades: where petioles run is a guess."""
-    points = stem.tube.points()
-    length = max(stem.tube.length, 1e-300)
-    radius = np.maximum(stem.tube.radius(), 0)
-    known = radius if radius.any() else np.full(len(points), STEM_WIDTH * length)
-    yield StemPart(f"stem_{stem.number}", None, points, known, STEM_COLOR)
+    """A stem, as thick as masks show it, and thin straight tubes from its nodes to the blades: petioles are guessed."""
+    length = max(stem.axis.length, 1e-300)
+    radius = stem.axis.radius if stem.axis.radius.any() else np.full(len(stem.axis.points), STEM_WIDTH * length)
+    yield StemPart(f"stem_{stem.number}", None, stem.axis.points, radius, STEM_COLOR)
     for node in stem.nodes:
         ends = np.array([node.place, node.base])
         if np.linalg.norm(ends[1] - ends[0]) > PETIOLE_WIDTH * length:

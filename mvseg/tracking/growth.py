@@ -115,7 +115,10 @@ def find_origins(tracks: Tracks, trait: str) -> dict[tuple[int, int], Hashable]:
         axis = index if date.up_from == "stem" else -1  # a stem leans otherwise on each date
         blades = [leaf for leaf in date.leaves if leaf.points is not None and "insertion_height" in leaf.numbers]
         lowest = min(blades, key=lambda leaf: float(np.asarray(leaf.points)[:, 2].min()), default=None)
-        nodes = {leaf.node: leaf.leaf for leaf in date.leaves if leaf.node is not None}
+        nodes: dict[tuple[int, int], set[int]] = {}
+        for leaf in date.leaves:
+            if leaf.node is not None:
+                nodes.setdefault(leaf.node, set()).add(track_of[index, leaf.leaf])
         for leaf in date.leaves:
             key: Hashable = ()
             if trait == "insertion_height":
@@ -124,8 +127,7 @@ def find_origins(tracks: Tracks, trait: str) -> dict[tuple[int, int], Hashable]:
                 key = axis
             elif leaf.node is not None and trait in ("node_height", "internode"):
                 stem, node = leaf.node
-                below = nodes.get((stem, 1 if trait == "node_height" else node - 1))
-                key = None if below is None else track_of[index, below]
+                key = frozenset(nodes.get((stem, 1 if trait == "node_height" else node - 1), ())) or None
             origins[index, track_of[index, leaf.leaf]] = key
     return origins
 

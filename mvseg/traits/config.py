@@ -22,7 +22,7 @@ class TraitsConfig:
             not judged by it.
         min_visible_share: of the pixels that a leaf's surface covers in the photos, its masks must cover this share; in
             [0, 1]. A surface that is hardly visible in any photo is in the wrong place.
-        leaves_only: leave out what looks like a stem: slender for its plant, and a tube explains its masks.
+        leaves_only: leave out what looks like a stem: slender for its plant.
         stems: auto: find the stems that the leaves sit on, with their nodes (docs/traits.md), where leaves and photos
             agree about them; off: do not look for any.
     """

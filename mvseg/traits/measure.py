@@ -26,7 +26,7 @@ from mvseg.traits.leaf import NEED_UP, Measurement, measure_leaf, measure_voxels
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import find_stems, fit_tubes, join_tubes, up_of_stem
+from mvseg.traits.stems import axes_of_masks, find_stems, up_of_stem
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
@@ -181,9 +181,9 @@ def measure_plant(
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     plant_stems: tuple[Stem, ...] = ()
     if config.stems == "auto":
-        ids = [instance for instance, each in rejected.items() if each.kind == "stem"]
-        tubes = join_tubes(fit_tubes(ids, surfaces or {}, masks, scene.cameras), masks, scene.cameras)
-        plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, tubes=tubes)
+        ids = sorted(instance for instance, each in rejected.items() if each.kind == "stem")
+        of_masks = axes_of_masks({stem: surfaces[stem] for stem in ids if surfaces and stem in surfaces})
+        plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, of_masks=of_masks)
     tilt_deg = 0.0
     if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
         frame, tilt_deg = level_frame(up), TILT_DEG

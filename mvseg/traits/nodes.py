@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from mvseg.arrays import Floats
-from mvseg.reconstruction.stem.leaf_bases import LeafBases, curve_of, project_bases
-from mvseg.reconstruction.stem.tube import Tube
+from mvseg.arrays import Floats, Ints
+from mvseg.reconstruction.stem.leaf_bases import LeafBases, project_bases
+from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.traits.leaf import VAGUE_DEG, Measurement, missing, wrap_azimuth
 
 ARCH_SD_DEG = 6.0  # fitted: python benchmarks/stems.py --cache DIR; of the angle by which petioles bend
@@ -24,23 +23,28 @@ LEAST_NODES = 4  # limit: leaves that suggest a phyllotaxis
 
 VAGUE = missing("not measured: the leaf begins at the stem, and points along it")
 FIRST_NODE = missing("not measured: the lowest node has none below")
+BELOW = missing("not measured: it lies below the end of the stem")
 
 
 @dataclass(frozen=True)
 class Node:
-    """Place where one leaf joins a stem; `leaf` is an instance id.
+    """One leaf at its node, the place where it joins a stem; `leaf` is an instance id.
 
     Attributes:
-        number: 1 for the lowest one of its stem.
-        place, base: (x, y, z) on the axis, and of the blade.
-        height: along the axis, from the foot of the stem or, where that is not known, from the lowest node.
+        number: of the node, 1 for the lowest one of its stem; several leaves may share it.
+        leaves_per_node: how many.
+        rank: 1 for the lowest leaf of the stem, counted upwards; leaves of one node in the order of their ids.
+        place, base: (x, y, z) of the node on the axis, and of the blade.
+        height: of the node along the axis, from the foot of the stem or, where that is not known, from the lowest node.
         internode: along the axis, from the node below.
-        divergence: degrees between its azimuth and that of the node below, in [0, 180].
+        divergence: degrees between the azimuths of the leaf and of that of the rank below, in [0, 180].
         insertion_angle: degrees between the petiole, or the midrib at the base without one, and the axis there.
-        azimuth: degrees about the axis, counterclockwise seen from above, in [0, 360).
+        node_azimuth: degrees of the leaf about the axis, counterclockwise seen from above, in [0, 360).
     """
 
     number: int
+    leaves_per_node: int
+    rank: int
     leaf: int
     place: tuple[float, float, float]
     base: tuple[float, float, float]
@@ -48,7 +52,7 @@ class Node:
     internode: Measurement
     divergence: Measurement
     insertion_angle: Measurement
-    azimuth: Measurement
+    node_azimuth: Measurement
 
 
 @dataclass(frozen=True)
@@ -71,101 +75,152 @@ UNCLEAR = Phyllotaxis("unclear", float("nan"), float("nan"))
 
 @dataclass(frozen=True, eq=False)
 class Stem:
-    """One stem with its nodes, and the phyllotaxis that these suggest; `number` 1, 2, ... of the plant.
+    """One stem with its leaves, and the phyllotaxis that these suggest; `number` 1, 2, ... of the plant.
 
     Attributes:
-        tube: upwards; of no radius where no view shows how thick it is.
+        axis: upwards.
         source: what showed it: "masks", "photos" or "leaf bases".
-        nodes: from the lowest to the highest one.
+        nodes: a row per leaf, by rank.
+        probability: that there is such a stem.
         tells_up: whether the direction in which it grows may be taken for up.
     """
 
     number: int
-    tube: Tube
+    axis: StemAxis
     source: str
     nodes: tuple[Node, ...]
     phyllotaxis: Phyllotaxis
+    probability: float = 1.0
     tells_up: bool = False
 
+    @property
+    def num_nodes(self) -> int:
+        return len({node.number for node in self.nodes})
+
     def __repr__(self) -> str:
-        return f"Stem({self.number}: {len(self.nodes)} nodes, from {self.source}, {self.phyllotaxis.name})"
+        return f"Stem({self.number}: {self.num_nodes} nodes, from {self.source}, {self.phyllotaxis.name})"
+
+
+@dataclass(frozen=True, eq=False)
+class _Places:
+    """N leaves along a stem, upwards.
+
+    Attributes:
+        ids, along: (N,) their ids, and where they join the axis, extended at both ends.
+        bases: (N, 3) of the blades.
+        azimuth, rising: (N,) degrees about the axis, and of the midrib or petiole against it.
+        along_sd, azimuth_sd, rising_sd: (N,) standard deviations.
+    """
+
+    ids: Ints
+    along: Floats
+    along_sd: Floats
+    bases: Floats
+    azimuth: Floats
+    azimuth_sd: Floats
+    rising: Floats
+    rising_sd: Floats
 
 
 def measure_stem(
-    tube: Tube,
+    axis: StemAxis,
     bases: LeafBases,
     *,
     frame: Floats | None,
     source: str,
     number: int = 1,
+    probability: float = 1.0,
     knows_foot: bool = False,
     tells_up: bool = False,
 ) -> Stem:
-    """Order the leaves that sit on a stem along it, and measure their nodes. `frame` has the (3, 3) rows east, north,
-    up (`level_frame`); None: azimuths start somewhere. With `knows_foot` heights start with the tube, not the lowest
-    node."""
-    curve = curve_of(tube)
+    """Order the leaves that sit on a stem along it, and measure their nodes. Leaves that would join it beyond its
+    extended ends have no node. `frame` has the (3, 3) rows east, north, up (`level_frame`); None: azimuths start
+    somewhere. With `knows_foot` heights start with the axis, not the lowest node."""
+    leaves = _place_leaves(axis, bases, frame)
+    if not len(leaves.ids):
+        return Stem(number, axis, source, (), UNCLEAR, probability, tells_up)
+    phyllotaxis, node_of = suggest_phyllotaxis(leaves.azimuth, leaves.azimuth_sd, leaves.along, leaves.along_sd)
+    counts, weights = np.bincount(node_of), 1 / leaves.along_sd**2
+    total = np.bincount(node_of, weights)
+    middle, sd = np.bincount(node_of, weights * leaves.along) / total, 1 / np.sqrt(total)
+    foot = axis.extension if knows_foot else middle[0]
+    # Where heights start from the lowest node, its error is in all of them.
+    start_sd = 0.0 if knows_foot else float(sd[0])
+    reach, curve = axis.extended_reach, axis.extend()
+    nodes: list[Node] = []
+    for rank, node in enumerate(node_of.tolist()):
+        internode = divergence = FIRST_NODE
+        if node:
+            apart_sd = float(np.hypot(sd[node], sd[node - 1]))
+            internode = Measurement(float(middle[node] - middle[node - 1]), apart_sd, source)
+        if rank:
+            apart = abs((float(leaves.azimuth[rank]) - float(leaves.azimuth[rank - 1]) + 180) % 360 - 180)
+            turn_sd = float(np.hypot(leaves.azimuth_sd[rank], leaves.azimuth_sd[rank - 1]))
+            divergence = Measurement(apart, turn_sd, source) if turn_sd <= VAGUE_DEG else VAGUE
+        turned = Measurement(wrap_azimuth(float(leaves.azimuth[rank])), float(leaves.azimuth_sd[rank]), source)
+        height = Measurement(float(middle[node] - foot), float(np.hypot(sd[node], start_sd)), source)
+        x, y, z = (float(np.interp(middle[node], reach, each)) for each in curve.T)
+        bx, by, bz = leaves.bases[rank].tolist()
+        nodes.append(
+            Node(
+                number=node + 1,
+                leaves_per_node=int(counts[node]),
+                rank=rank + 1,
+                leaf=int(leaves.ids[rank]),
+                place=(x, y, z),
+                base=(bx, by, bz),
+                height=height if height.value >= 0 else BELOW,
+                internode=internode,
+                divergence=divergence,
+                insertion_angle=Measurement(float(leaves.rising[rank]), float(leaves.rising_sd[rank]), source),
+                node_azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
+            )
+        )
+    return Stem(
+        number=number,
+        axis=axis,
+        source=source,
+        nodes=tuple(nodes),
+        phyllotaxis=phyllotaxis,
+        probability=probability,
+        tells_up=tells_up,
+    )
+
+
+def _place_leaves(axis: StemAxis, bases: LeafBases, frame: Floats | None) -> _Places:
+    curve, reach = axis.extend(), axis.extended_reach
     places, misses, along = project_bases(bases, curve)
-    steps = np.linalg.norm(np.diff(curve, axis=0), axis=1)
-    reach = np.append(0, steps.cumsum())
-    foot = reach[1] if knows_foot else float(along.min(initial=np.inf))
-    tangents = np.stack([np.interp(along, reach, axis) for axis in np.gradient(curve, reach, axis=0).T], 1)
+    slopes = np.gradient(curve, reach, axis=0)
+    tangents = np.stack([np.interp(along, reach, each) for each in slopes.T], 1)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    on_axis = np.stack([np.interp(along, reach, axis) for axis in curve.T], 1)
+    on_axis = np.stack([np.interp(along, reach, each) for each in curve.T], 1)
     petiole = np.linalg.norm(bases.points - places, axis=1)
     lever = bases.near - on_axis
     across = lever - (lever * tangents).sum(1, keepdims=True) * tangents
     east = _reference(tangents, frame)
     north = np.cross(tangents, east)
-    azimuth = np.degrees(np.arctan2((across * north).sum(1), (across * east).sum(1)))
     axis_sd = MISS_SHARE * float(np.median(misses)) if len(misses) else 0.0
     sideways = np.hypot(axis_sd, bases.point_sd) / np.maximum(np.linalg.norm(across, axis=1), 1e-12)
-    azimuth_sd = np.hypot(np.degrees(sideways), BLADE_SD_DEG)
     rising = np.degrees(np.arccos(np.clip((bases.ahead * tangents).sum(1), -1, 1)))
     slant = np.tan(np.radians(np.clip(rising, 5, 175)))
     turn_sd = np.hypot(np.radians(ARCH_SD_DEG), bases.angle_sd)
-    height_sd = np.sqrt(
+    along_sd = np.sqrt(
         bases.point_sd**2 + (petiole * turn_sd) ** 2 + np.minimum(axis_sd / np.abs(slant), petiole + axis_sd) ** 2
         + (MISS_SHARE * misses) ** 2
     )  # fmt: skip
-    angle_sd = np.hypot(np.degrees(turn_sd), ARCH_SD_DEG)
-    order = np.lexsort((bases.ids, along))
-    # Where heights start from the lowest node, its error is in all of them.
-    start_sd = float(height_sd[order[0]]) if len(order) and not knows_foot else 0.0
-    nodes: list[Node] = []
-    for rank, leaf in enumerate(order.tolist()):
-        below = order[rank - 1] if rank else None
-        internode = divergence = FIRST_NODE
-        if below is not None:
-            sd = float(np.hypot(height_sd[leaf], height_sd[below]))
-            internode = Measurement(float(along[leaf] - along[below]), sd, source)
-            sd = float(np.hypot(azimuth_sd[leaf], azimuth_sd[below]))
-            apart = abs((float(azimuth[leaf]) - float(azimuth[below]) + 180) % 360 - 180)
-            divergence = Measurement(apart, sd, source) if sd <= VAGUE_DEG else VAGUE
-        turned = Measurement(wrap_azimuth(float(azimuth[leaf])), float(azimuth_sd[leaf]), source)
-        x, y, z = on_axis[leaf].tolist()
-        bx, by, bz = bases.points[leaf].tolist()
-        nodes.append(
-            Node(
-                number=rank + 1,
-                leaf=int(bases.ids[leaf]),
-                place=(x, y, z),
-                base=(bx, by, bz),
-                height=Measurement(float(along[leaf]) - foot, float(np.hypot(height_sd[leaf], start_sd)), source),
-                internode=internode,
-                divergence=divergence,
-                insertion_angle=Measurement(float(rising[leaf]), float(angle_sd[leaf]), source),
-                azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
-            )
-        )
-    return Stem(
-        number=number,
-        tube=tube,
-        source=source,
-        nodes=tuple(nodes),
-        phyllotaxis=suggest_phyllotaxis(nodes),
-        tells_up=tells_up,
+    leaves = _Places(
+        ids=bases.ids,
+        along=along,
+        along_sd=np.maximum(along_sd, 1e-9 * axis.length),
+        bases=bases.points,
+        azimuth=np.degrees(np.arctan2((across * north).sum(1), (across * east).sum(1))),
+        azimuth_sd=np.hypot(np.degrees(sideways), BLADE_SD_DEG),
+        rising=rising,
+        rising_sd=np.hypot(np.degrees(turn_sd), ARCH_SD_DEG),
     )
+    order = np.lexsort((bases.ids, along))
+    order = order[(along[order] > 0) & (along[order] < reach[-1])]  # others would join it where the curve is cut
+    return _Places(**{field.name: getattr(leaves, field.name)[order] for field in fields(_Places)})
 
 
 def _reference(tangents: Floats, frame: Floats | None) -> Floats:
@@ -176,35 +231,51 @@ def _reference(tangents: Floats, frame: Floats | None) -> Floats:
     return np.asarray(level / np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12))
 
 
-def suggest_phyllotaxis(nodes: Sequence[Node]) -> Phyllotaxis:
-    """Compare how likely the azimuths and heights of nodes, upwards, are with each phyllotaxis. All four are equally
+def suggest_phyllotaxis(azimuth: Floats, azimuth_sd: Floats, along: Floats, sd: Floats) -> tuple[Phyllotaxis, Ints]:
+    """Compare how likely azimuths and heights of leaves (N,), upwards, are with each phyllotaxis. All four are equally
     likely beforehand: distichous, decussate (pairs at right angles), a spiral of any angle in `SPIRAL_DEG`, either way
-    round, and none of these."""
-    if len(nodes) < LEAST_NODES:
-        return UNCLEAR
-    azimuth = np.array([node.azimuth.value if node.azimuth.exists else 0.0 for node in nodes])
-    sd = np.hypot([node.azimuth.sd if node.azimuth.exists else 180.0 for node in nodes], JITTER_DEG)
-    height = np.array([node.height.value for node in nodes])
-    height_sd = np.array([node.height.sd for node in nodes])
-    single = _gap_evidence(np.diff(height))
-    turns = np.arange(len(nodes))
+    round, and none of these.
+
+    Returns:
+        The likeliest, and (N,) the node of each leaf, 0 for the lowest: each its own where leaves come one by one,
+        pairs where they are decussate; else leaves less than their standard deviation apart share a node.
+    """
+    close = group_leaves(along, sd)
+    if len(along) < LEAST_NODES:
+        return UNCLEAR, close
+    turn_sd = np.hypot(np.where(azimuth_sd <= VAGUE_DEG, azimuth_sd, 180.0), JITTER_DEG)
+    single = _gap_evidence(np.diff(along))
+    turns = np.arange(len(along))
     spirals = np.array([
         np.logaddexp.reduce([
-            _log_mean(_log_normal(azimuth - START_DEG - way * angle * turns, sd).sum(1)) for way in (-1, 1)
+            _log_mean(_log_normal(azimuth - START_DEG - way * angle * turns, turn_sd).sum(1)) for way in (-1, 1)
         ])
         for angle in SPIRAL_DEG
     ])  # fmt: skip
-    pairs = [_pair_azimuths(azimuth, sd, first) + _pair_gaps(height, height_sd, first) for first in (0, 1)]
+    gaps = [_pair_gaps(along, sd, first) for first in (0, 1)]
+    pairs = [_pair_azimuths(azimuth, turn_sd, first) + gaps[first] for first in (0, 1)]
     evidence = {
-        "distichous": _log_mean(_log_normal(azimuth - START_DEG - 180 * turns, sd).sum(1)) + single,
+        "distichous": _log_mean(_log_normal(azimuth - START_DEG - 180 * turns, turn_sd).sum(1)) + single,
         "spiral": _log_mean(spirals) - np.log(2) + single,
         "decussate": _log_mean(np.array(pairs)),
-        "unclear": -len(nodes) * np.log(360.0) + max(single, *(_pair_gaps(height, height_sd, each) for each in (0, 1))),
+        "unclear": -len(along) * np.log(360.0) + max(single, *gaps),
     }
     total = np.logaddexp.reduce(list(evidence.values()))
     name = max(evidence, key=lambda each: evidence[each])
     angle = {"distichous": 180.0, "decussate": 90.0, "spiral": float(SPIRAL_DEG[spirals.argmax()])}.get(name, np.nan)
-    return Phyllotaxis(name, float(angle), float(np.exp(evidence[name] - total)))
+    node_of = {"unclear": close, "decussate": (turns + int(np.argmax(pairs))) // 2}.get(name, turns)
+    return Phyllotaxis(name, float(angle), float(np.exp(evidence[name] - total))), node_of - node_of.min(initial=0)
+
+
+def group_leaves(along: Floats, sd: Floats) -> Ints:
+    """(N,) the node of each leaf, from 0, at places along (N,), upwards: a leaf joins the node below if it is less than
+    its standard deviation (N,) away from the lowest leaf of that."""
+    node_of, lowest = np.zeros(len(along), int), 0
+    for leaf in range(1, len(along)):
+        is_new = along[leaf] - along[lowest] >= np.hypot(sd[leaf], sd[lowest]) / np.sqrt(2)
+        node_of[leaf] = node_of[leaf - 1] + is_new
+        lowest = leaf if is_new else lowest
+    return node_of
 
 
 def _log_normal(degrees: Floats, sd: Floats) -> Floats:

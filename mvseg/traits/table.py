@@ -11,7 +11,7 @@ import numpy as np
 
 from mvseg.errors import InputError
 from mvseg.formats.text_file import read_table, write_table
-from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import GOOD, LeafTraits, Traits, UpFrom
@@ -20,11 +20,12 @@ from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNK
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
 MOST_BYTES = 1 << 30  # limit: of a table that is read
-NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "azimuth")
+NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "node_azimuth")
 NODE_COLUMNS = (
-    "plant", "stem", "node", "leaf", *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),
-    "x", "y", "z", "base_x", "base_y", "base_z", "unit", "source", "phyllotaxis", "phyllotaxis_angle",
-    "phyllotaxis_probability",
+    "plant", "stem", "node", "leaves_per_node", "rank", "leaf",
+    *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),
+    "x", "y", "z", "base_x", "base_y", "base_z", "unit", "source", "stem_probability", "phyllotaxis",
+    "phyllotaxis_angle", "phyllotaxis_probability",
 )  # fmt: skip
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 
@@ -51,24 +52,25 @@ def write_wide(path: Path, traits: Traits) -> None:
 
 
 def write_nodes(path: Path, traits: Traits) -> None:
-    """One row per node, from the lowest to the highest one of each stem: its leaf, its numbers with their standard
-    deviations, where it is and where the blade begins, and the phyllotaxis of its stem."""
+    """One row per leaf of a stem, by rank: its node, its numbers with their standard deviations, where the node is and
+    where the blade begins, and how likely the stem and its phyllotaxis are."""
     rows = []
     for stem in traits.stems:
         suggested = stem.phyllotaxis
         for node in stem.nodes:
             measured = (getattr(node, name) for name in NODE_NUMBERS)
             numbers = [*chain.from_iterable((each.value, each.sd) for each in measured), *node.place, *node.base]
-            texts = traits.unit or UNKNOWN_UNIT, stem.source, suggested.name
+            texts = traits.unit or UNKNOWN_UNIT, stem.source, stem.probability, suggested.name
             of_stem = suggested.angle, suggested.probability
-            rows.append((traits.plant, stem.number, node.number, node.leaf, *numbers, *texts, *of_stem))
+            counted = node.number, node.leaves_per_node, node.rank, node.leaf
+            rows.append((traits.plant, stem.number, *counted, *numbers, *texts, *of_stem))
     write_table(path, NODE_COLUMNS, rows)
 
 
 def read_nodes(path: Path) -> tuple[Stem, ...]:
     """The stems that `write_nodes` wrote, with straight axes from node to node. Raises InputError for another table."""
     nodes: dict[int, list[Node]] = {}
-    about: dict[int, tuple[str, Phyllotaxis]] = {}
+    about: dict[int, tuple[str, float, Phyllotaxis]] = {}
     try:
         for row in read_csv(path, NODE_COLUMNS):
             numbers = {
@@ -77,18 +79,21 @@ def read_nodes(path: Path) -> tuple[Stem, ...]:
             }
             place = _number(row["x"]), _number(row["y"]), _number(row["z"])
             base = _number(row["base_x"]), _number(row["base_y"]), _number(row["base_z"])
-            stem, number, leaf = (int(row[name]) for name in ("stem", "node", "leaf"))
-            nodes.setdefault(stem, []).append(Node(number=number, leaf=leaf, place=place, base=base, **numbers))
+            stem, number, leaf, rank = (int(row[name]) for name in ("stem", "node", "leaf", "rank"))
+            node = Node(number, int(row["leaves_per_node"]), rank, leaf, place, base, **numbers)
+            nodes.setdefault(stem, []).append(node)
             angle, probability = _number(row["phyllotaxis_angle"]), _number(row["phyllotaxis_probability"])
-            about[stem] = row["source"], Phyllotaxis(row["phyllotaxis"], angle, probability)
+            likely = _number(row["stem_probability"])
+            about[stem] = row["source"], likely, Phyllotaxis(row["phyllotaxis"], angle, probability)
     except (KeyError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: is no table of nodes that mvseg wrote ({error})") from None
-    return tuple(
-        Stem(stem, Tube.along(np.array([node.place for node in each])), about[stem][0], tuple(each), about[stem][1])
-        for stem, each in nodes.items()
-    )  # fmt: skip
+    stems = []
+    for number, rows in nodes.items():
+        (source, probability, phyllotaxis), axis = about[number], StemAxis.along(np.array([row.place for row in rows]))
+        stems.append(Stem(number, axis, source, tuple(rows), phyllotaxis, probability))
+    return tuple(stems)
 
 
 def _number(text: str) -> float:

@@ -19,7 +19,7 @@ def stem() -> Stem:
     leaves = {leaf: move(each, np.eye(3), shift=tuple(9 * each.midrib[5].numpy() * [1, 1, 0] / 9))
               for leaf, each in leaves.items()}  # fmt: skip
     (axis,) = axes_of_bases(leaves, UP)
-    return measure_stem(axis.tube, axis.bases, frame=None, source="leaf bases")
+    return measure_stem(axis.axis, axis.bases, frame=None, source="leaf bases")
 
 
 def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -> None:
@@ -37,7 +37,7 @@ def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -
 
 
 def test_a_radius_that_is_known_is_drawn(stem: Stem) -> None:
-    thick = replace(stem, tube=replace(stem.tube, radii=np.full(3, 4.0)))
+    thick = replace(stem, axis=replace(stem.axis, radius=np.full(len(stem.axis.points), 4.0)))
     (trunk, *_) = stem_parts(thick)
     assert trunk.radius == pytest.approx(4.0)
-    assert trunk.mesh().volume == pytest.approx(np.pi * 16 * stem.tube.length, rel=0.08)
+    assert trunk.mesh().volume == pytest.approx(np.pi * 16 * stem.axis.length, rel=0.08)

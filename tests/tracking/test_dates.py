@@ -14,7 +14,7 @@ import pytest
 from known_leaves import make_surface
 from mvseg import load_result
 from mvseg.errors import InputError
-from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.tracking.dates import Number, date_of, name_apart, order_dates, read_date, read_time
 from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.traits.leaf import Measurement, missing
@@ -168,9 +168,9 @@ def test_results_in_memory() -> None:
     assert date.leaves[0].numbers == {"length": Number(80.0, 2.0, "mm")}
     assert date.whole["total_leaf_area"].unit == "mm^2"
     angle, nothing = Measurement(137.5, 4.0, "leaf bases"), missing("the lowest one")
-    node = Node(2, 1, (0, 0, 1), (0, 1, 1), height=angle, internode=Measurement(9.0, 1.0, "leaf bases"),
-                divergence=angle, insertion_angle=nothing, azimuth=nothing)  # fmt: skip
-    stem = Stem(1, Tube.along(np.array([[0.0, 0, 0], [0, 0, 1]])), "leaf bases", (node,), UNCLEAR)
+    node = Node(2, 1, 2, 1, (0, 0, 1), (0, 1, 1), height=angle, internode=Measurement(9.0, 1.0, "leaf bases"),
+                divergence=angle, insertion_angle=nothing, node_azimuth=nothing)  # fmt: skip
+    stem = Stem(1, StemAxis.along(np.array([[0.0, 0, 0], [0, 0, 1]])), "leaf bases", (node,), UNCLEAR)
     result.traits = replace(traits, stems=(stem,))
     on_stem, elsewhere = date_of(result, 3).leaves
     assert (on_stem.node, elsewhere.node) == ((1, 2), None)

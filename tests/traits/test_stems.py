@@ -12,19 +12,19 @@ from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, move, turn_about
 from mvseg.errors import InputError
 from mvseg.masks import Masks
-from mvseg.reconstruction.stem.fit_tube import fit_tube
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases, find_ends
+from mvseg.reconstruction.stem.stem_axis import StemAxis, sweep_circle
 from mvseg.reconstruction.stem.stem_path import find_path
 from mvseg.reconstruction.stem.thin_parts import ThinView, find_cells, see_thin, share_of_views
-from mvseg.reconstruction.stem.tube import Tube
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import regions_from_label_maps
 from mvseg.traits.measure import Traits
-from mvseg.traits.nodes import Stem
-from mvseg.traits.stems import StemTube, find_stems, join_tubes, up_of_stem
+from mvseg.traits.nodes import Stem, group_leaves
+from mvseg.traits.stems import MaskAxis, axes_of_masks, find_stems, up_of_stem
 from mvseg.traits.table import read_nodes, write_nodes
 from mvseg.traits.up import level_frame
-from tube_scene import BENT, T, stack, tube_masks
+from tube_scene import BENT, T, tube_masks
 from warned import warns_of
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -73,7 +73,10 @@ def test_leaves_are_ordered_along_their_stem(name: str, up: np.ndarray | None) -
     assert stem.source == "leaf bases"
     assert (stem.phyllotaxis.name, stem.phyllotaxis.angle) == (name, angle)
     assert stem.phyllotaxis.probability > 0.9
-    assert [node.number for node in stem.nodes] == list(range(1, 9))
+    assert [node.rank for node in stem.nodes] == list(range(1, 9))
+    per_node = 2 if name == "decussate" else 1
+    assert [node.number for node in stem.nodes] == [1 + rank // per_node for rank in range(8)]
+    assert {node.leaves_per_node for node in stem.nodes} == {per_node}
     order = [node.leaf for node in stem.nodes]
     pairs = [{*order[n : n + 2]} for n in range(0, 8, 2)]
     assert pairs == [{(5 * n) % 11 + 1, (5 * n + 5) % 11 + 1} for n in range(0, 8, 2)]
@@ -93,8 +96,8 @@ def test_leaves_are_ordered_along_their_stem(name: str, up: np.ndarray | None) -
 
 def test_azimuths_are_those_of_the_level_frame() -> None:
     (stem,) = stems_of(PLANTS["spiral"][1])
-    found = [node.azimuth.value for node in stem.nodes]
-    assert np.exp(1j * np.radians(found)) == pytest.approx(
+    measured = [node.node_azimuth.value for node in stem.nodes]
+    assert np.exp(1j * np.radians(measured)) == pytest.approx(
         np.exp(1j * np.radians([30 - 137.5 * n for n in range(8)])), abs=0.1
     )
 
@@ -194,7 +197,7 @@ def test_of_two_stems_in_one_pot_the_one_that_is_shown_tells_no_up() -> None:
 def test_masks_of_stems_tell_better_than_leaves() -> None:
     """Upwards, with a radius, and heights from the foot."""
     cameras = ring_cameras(10)
-    tube: Tube = fit_tube(stack(tube_masks(BENT, 0.06 + 0 * T), cameras))
+    axis = StemAxis(BENT, 0.06 + 0 * T)
     leaves = {}
     for number, place in enumerate((20, 32, 44), start=1):
         azimuth = 100.0 * number
@@ -207,14 +210,14 @@ def test_masks_of_stems_tell_better_than_leaves() -> None:
         cameras,
         frame=level_frame(UP),
         photos=NO_PHOTOS,
-        tubes=[StemTube(tube.reverse(), knows_foot=True)],  # type: ignore[arg-type]
+        of_masks=[MaskAxis(axis.reverse(), knows_foot=True)],  # type: ignore[arg-type]
     )
     assert stem.source == "masks"
     assert stem.tells_up
     assert [node.leaf for node in stem.nodes] == [1, 2, 3]
     along = np.append(0, np.linalg.norm(np.diff(BENT, axis=0), axis=1).cumsum())
     assert [node.height.value for node in stem.nodes] == pytest.approx(along[[20, 32, 44]], abs=0.04)
-    assert stem.tube.points()[0, 2] < stem.tube.points()[-1, 2]
+    assert stem.axis.points[0, 2] < stem.axis.points[-1, 2]
 
 
 @pytest.mark.parametrize("case", ["whole", "internodes", "pot"])
@@ -225,16 +228,31 @@ def test_masks_of_internodes_are_one_stem_and_a_pot_is_no_foot(case: str) -> Non
     drawn = [tube_masks(BENT[part], radius[part]) for part in parts]
     maps = [np.select(views, range(1, len(parts) + 1)) for views in zip(*drawn, strict=True)]
     regions = regions_from_label_maps([each.astype(np.int64) for each in maps])
-    masks = replace(Masks.of(regions), instance_ids=regions.labels)
-    tubes = {number: fit_tube(stack(each, cameras)) for number, each in enumerate(drawn, start=1)}
+    surfaces = fit_surfaces(regions, regions.labels, cameras)
     if case == "pot":
         with warns_of("stem_with_pot"):
-            (joined,) = join_tubes(tubes, masks, cameras)
+            (joined,) = axes_of_masks(surfaces)
     else:
-        (joined,) = join_tubes(tubes, masks, cameras)
+        (joined,) = axes_of_masks(surfaces)
         length = float(np.linalg.norm(np.diff(BENT, axis=0), axis=1).sum())
-        assert joined.tube.length == pytest.approx(length, rel=0.06)
+        assert joined.axis.length == pytest.approx(length, rel=0.1)
+        away = np.linalg.norm(joined.axis.points[:, None] - BENT, axis=2).min(1)
+        assert float(np.median(away)) < 0.03
+        assert 0.05 < float(np.median(joined.axis.radius)) < 0.1
     assert joined.knows_foot == (case != "pot")
+
+
+def test_a_stem_is_drawn_as_a_tube_of_its_radius() -> None:
+    mesh = sweep_circle(BENT, 0.06 + 0 * T)
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(np.pi * 0.06**2 * StemAxis.along(BENT).length, rel=0.06)
+
+
+def test_leaves_closer_than_their_deviation_share_a_node() -> None:
+    along = np.array([0.0, 0.5, 1.2, 1.9, 5.0])
+    assert group_leaves(along, np.ones(5)).tolist() == [0, 0, 1, 1, 2]
+    assert group_leaves(7 * along, np.full(5, 7.0)).tolist() == [0, 0, 1, 1, 2]
+    assert group_leaves(along, np.full(5, 0.1)).tolist() == [0, 1, 2, 3, 4]
 
 
 def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -243,14 +261,14 @@ def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
     write_nodes(path, Traits("=plant", "mm", (), {}, None, stems))
     text = path.read_text()
     assert text.count("\n") == 9
-    assert "\n'=plant,1,1," in text
+    assert "\n'=plant,1,1,2,1," in text
     (again,) = read_nodes(path)
     assert (again.source, again.phyllotaxis.name) == ("leaf bases", "decussate")
     for one, two in zip(stems[0].nodes, again.nodes, strict=True):
-        assert (one.leaf, one.number) == (two.leaf, two.number)
+        assert (one.leaf, one.number, one.rank) == (two.leaf, two.number, two.rank)
         assert two.height.value == pytest.approx(one.height.value, abs=1e-3)
         assert two.place == pytest.approx(one.place, abs=1e-2)
-    path.write_text(text.replace(",1,1,", ",x,1,", 1))
+    path.write_text(text.replace(",1,1,2,", ",x,1,2,", 1))
     with pytest.raises(InputError, match="no table of nodes"):
         read_nodes(path)
 
@@ -330,6 +348,6 @@ def test_a_leaf_along_its_stem_has_no_azimuth_but_a_height() -> None:
     (stem,) = stems_of(leaves)
     top = next(node for node in stem.nodes if node.leaf == 11)
     assert top.height.exists
-    assert not top.azimuth.exists
+    assert not top.node_azimuth.exists
     assert not top.divergence.exists
     assert stem.phyllotaxis.name in ("spiral", "unclear")

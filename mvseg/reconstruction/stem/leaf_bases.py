@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import AXES
-from mvseg.reconstruction.stem.tube import AXIS, Tube, axis_slopes, tube_places
-from mvseg.reconstruction.surface.leaf_patch import patch_basis, spline_basis
+from mvseg.reconstruction.stem.stem_axis import StemAxis
+from mvseg.reconstruction.surface.leaf_patch import patch_basis
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 
@@ -90,12 +90,12 @@ class BaseAxis:
     """An axis, and the leaves that point to it.
 
     Attributes:
-        tube: of no radius, from the lowest node to the highest one; upwards.
+        axis: from the lowest node to the highest one; upwards.
         bases: of N leaves, at the ends that are nearer to the axis.
         is_near: (N,) bool, a leaf whose ray passes near it.
     """
 
-    tube: Tube
+    axis: StemAxis
     bases: LeafBases
     is_near: NDArray[np.bool_]
 
@@ -137,8 +137,8 @@ def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAx
     if float(np.ptp(along[is_near])) < AXES.least_extent * width:
         return None
     rising = bases.ahead[is_near].sum(0) if up is None else up
-    tube = Tube.along(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1])
-    return BaseAxis(tube, bases, is_near)
+    axis = StemAxis.along(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1])
+    return BaseAxis(axis, bases, is_near)
 
 
 def _start_lines(first: LeafBases, second: LeafBases, up: Floats | None, *, size: float) -> list[tuple[Floats, Floats]]:
@@ -299,12 +299,3 @@ def _nearest_on_rays(bases: LeafBases, back: Floats, curve: Floats, t: Floats) -
     reach = np.append(0, np.sqrt(size).cumsum())
     along = reach[piece] + share[rows, best, piece] * np.sqrt(size[piece])
     return t[rows, best], gap[rows, best], along
-
-
-def curve_of(tube: Tube) -> Floats:
-    """(P, 3) the points of a tube's axis, extended straight at both ends by `AXES.beyond` of its length."""
-    u = tube_places(AXES.points)
-    points = spline_basis(u, AXIS) @ tube.axis
-    ends = axis_slopes(np.array([0.0, 1.0])) @ tube.axis
-    ends *= (AXES.beyond * tube.length / np.maximum(np.linalg.norm(ends, axis=1), 1e-300))[:, None]
-    return np.concatenate([points[:1] - ends[:1], points, points[-1:] + ends[1:]])

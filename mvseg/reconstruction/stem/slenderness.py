@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.special import expit
 
-from mvseg.reconstruction.numbers import TUBE
+from mvseg.reconstruction.numbers import STEM
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 
@@ -17,6 +17,6 @@ def stem_chances(surfaces: Mapping[int, LeafSurface]) -> dict[int, float]:
     aspects = {instance: each.length / each.width for instance, each in surfaces.items() if each.exists}
     usual = np.median(list(aspects.values())) if aspects else 1.0
     return {
-        instance: float(expit(np.log(aspect / usual / TUBE.stem_aspect) / TUBE.aspect_scale))
+        instance: float(expit(np.log(aspect / usual / STEM.stem_aspect) / STEM.aspect_scale))
         for instance, aspect in aspects.items()
     }

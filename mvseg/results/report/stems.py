@@ -40,10 +40,13 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
         nodes = [
-            {"leaf": node.leaf, "height": short_number(node.height.value), "azimuth": short_number(node.azimuth.value)}
+            {"leaf": node.leaf, "node": node.number}
+            | {name: short_number(getattr(node, name).value) for name in ("height", "node_azimuth")}
+            | {"sd": short_number(node.height.sd)}
             for node in stem.nodes
         ]
         about: dict[str, Any] = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
+        about["chance"] = round(stem.probability, 3)
         if np.isfinite(suggested.probability):
             about["probability"] = round(suggested.probability, 3)
         if np.isfinite(suggested.angle):
