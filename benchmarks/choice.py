@@ -78,9 +78,7 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
     truth = true_maps(folder, scene)
     found = find_leaves(detect_scene(Photos(scene), DetectConfig(image_size=size)), scene.cameras)
     table, matched = found.proposals, found.matched
-    rows = [masks.proposal for masks in matched]
-    fit = Judges(scene.cameras).fit
-    candidates = gather_candidates(matched, rows, table=table, fit=fit)
+    candidates = gather_candidates(matched, table, Judges(scene.cameras).fit)
     drawn = draw_views(table.regions, candidates.surfaces, scene.cameras, photos=Photos(scene))
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]

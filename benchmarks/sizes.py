@@ -61,12 +61,12 @@ def sweep(folder: Path, cache: Path) -> tuple[float, float]:
     truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
     detections, detect = CachedDetections(cache), opened.config.detect
     first = run_pass(few, detect, cache=detections)
-    boxes, colors = first.passes[0].boxes, colors_to_judge_by(few, first)
+    boxes, colors = first.detected.boxes, colors_to_judge_by(few, first)
     boxes = whole_photos(few.scene) if boxes is None else boxes
     scores: dict[int, float] = {}
 
     def show(result: PassResult, begun: float) -> PassResult:
-        result, masks, size = judge_pass(few, result, colors), result.leaves.masks, result.passes[0].longest
+        result, masks, size = judge_pass(few, result, colors), result.leaves.masks, result.detected.longest
         maps = None if truth is None else [truth[view] for view in views.tolist()]
         scores[size] = np.nan if maps is None else leaf_metrics(masks.regions, masks.instance_ids, maps).mv_pq
         area, seconds = result.rating.agreed_area / 1e6, time.process_time() - begun
@@ -81,13 +81,13 @@ def sweep(folder: Path, cache: Path) -> tuple[float, float]:
     print(f"\n**{folder.resolve().name}**, {len(views)} photos\n")
     print("| px | leaves | agreement | agreed area, Mpx | E | MV-PQ | CPU s |\n" + "|---" * 7 + "|")
     results = [show(first, time.process_time())]
-    while (size := results[0].passes[0].longest * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
+    while (size := results[0].detected.longest * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
         results.append(see(round(size)))
-    by_size = {round(results[0].passes[0].longest * DETECTION.size_step**n): each for n, each in enumerate(results)}
+    by_size = {round(results[0].detected.longest * DETECTION.size_step**n): each for n, each in enumerate(results)}
     best = results[order_ratings([each.rating for each in results])[0]]
     searched = choose_size(by_size.__getitem__, results[0])[0]
     most = max(scores.values())
-    losses = [most - scores[each.passes[0].longest] for each in (best, searched)]
+    losses = [most - scores[each.detected.longest] for each in (best, searched)]
     print(f"\nlost over the whole range {losses[0]:.3f}, by the search {losses[1]:.3f}", flush=True)
     return losses[0], losses[1]
 

@@ -73,7 +73,7 @@ from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
 from mvseg.verification.choose import Judges, choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
-from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, ROUGH, SNAP
+from mvseg.verification.numbers import CHOICE, COLORS, DRAWN, EVIDENCE, SNAP
 from mvseg.verification.snap_edges import snap_masks
 
 FACTOR = 1.33
@@ -202,8 +202,8 @@ class Trial:
     truth: Any
 
 
-CHECKING = (EVIDENCE, AGAIN)
-CHOOSING = (EVIDENCE, CHOICE, ROUGH, SNAP)
+CHECKING = (EVIDENCE,)
+CHOOSING = (EVIDENCE, CHOICE, SNAP)
 DRAWING = (DRAWN, COLORS)
 
 
@@ -252,7 +252,7 @@ def choose_anew(plant: Plant) -> Masks:
 
 
 def follow_anew(plant: Plant, masks: Masks) -> Masks:
-    return follow_drawn(masks, cameras=plant.scene.cameras, photos=plant.opened.photos)[0]
+    return follow_drawn(masks, cameras=plant.scene.cameras, photos=plant.opened.photos)
 
 
 def draw(case: Case, first: Masks, number: int) -> Masks:
@@ -268,7 +268,7 @@ def draw(case: Case, first: Masks, number: int) -> Masks:
     outlines = regions_from_label_maps(maps)
     drawn = Masks.of(outlines, outlines.labels, torch.ones(len(outlines)), origin=Origin.CORRECTED)
     left = replace(first, instance_ids=ids).select((ids > 0) | (first.view_index % 2 == 0))
-    return Masks.concatenate((left, drawn)).close_gaps()
+    return Masks.concatenate((left, drawn))
 
 
 def count_changed(before: Masks, after: Masks) -> int:

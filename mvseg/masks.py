@@ -5,10 +5,10 @@ A stage takes `Masks` and gives `Masks` back; nothing about a mask is kept anywh
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,8 +16,6 @@ from torch import Tensor
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.regions import Regions, stack_regions
-
-T = TypeVar("T")
 
 STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
 SURE = 0.5  # definition: match score, or q, from which a mask likelier shows an instance than not
@@ -149,18 +147,6 @@ class Masks:
 
         ids = lookup[torch.where(self.instance_ids > 0, self.instance_ids - 1, len(numbers))]
         return replace(self, instance_ids=ids, match_scores=self.match_scores * (ids > 0))
-
-    def close_gaps(self) -> Masks:
-        """The ids as 1, 2, ... without gaps, in the order that they have."""
-        used = self.instance_ids[self.instance_ids > 0].unique()
-        numbers = torch.full((self.num_instances,), -1, dtype=torch.int64, device=used.device)
-        numbers[used - 1] = torch.arange(1, len(used) + 1, device=used.device)
-        return self.relabel(numbers)
-
-    def renumber(self, of_instances: Mapping[int, T]) -> dict[int, T]:
-        """Rename keys from ids of masks to the ids that `close_gaps` gives them."""
-        used = self.instance_ids[self.instance_ids > 0].unique().tolist()
-        return {new: of_instances[old] for new, old in enumerate(used, start=1) if old in of_instances}
 
     @staticmethod
     def concatenate(parts: Sequence[Masks]) -> Masks:

@@ -12,7 +12,7 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching
 from mvseg.pipeline.open_scene import Opened
-from mvseg.scene import Cameras, Scene
+from mvseg.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +33,10 @@ class FoundMasks:
         numbered = replace(numbered, origin=torch.full_like(masks.origin, Origin.DETECTED))
         return FoundMasks(matching.with_masks(numbered), numbered)
 
-    def match(self, cameras: Cameras, min_score: float) -> Matching:
+    def match(self, min_score: float) -> Matching:
         return self.sure.with_masks(self.more or self.sure.masks)
 
-    def proposals(self, cameras: Cameras) -> Masks:
+    def proposals(self) -> Masks:
         return self.excessive
 
 

@@ -70,14 +70,6 @@ def test_other_numbers_are_refused(numbers: list[int]) -> None:
         table().relabel(torch.tensor([1, 2]))
 
 
-def test_gaps_between_ids_close_up_and_what_is_known_by_them_follows() -> None:
-    gappy = replace(table(), instance_ids=torch.tensor([7, 2, 7, -1, 4]))
-    closed = gappy.close_gaps()
-    assert closed.instance_ids.tolist() == [3, 1, 3, -1, 2]
-    assert gappy.renumber({2: "b", 7: "a", 9: "c"}) == {1: "b", 3: "a"}
-    assert same(closed.close_gaps(), closed)
-
-
 def test_concatenated_tables_share_no_instance() -> None:
     joined = Masks.concatenate([table(), table()])
     assert joined.instance_ids.tolist() == [2, 1, 2, -1, 3, 5, 4, 5, -1, 6]

@@ -8,7 +8,6 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -305,9 +304,8 @@ def test_shapes_with_a_reason_are_doubtful() -> None:
     surfaces = {
         leaf: replace(bent_blade(), quality=Quality(dict.fromkeys(each, "why"))) for leaf, each in enumerate(codes, 1)
     }
-    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces), has_stems=False)  # type: ignore[arg-type]
+    finding = _find_doubtful(surfaces, [])
     assert finding.values == {"count": 2, "total": 4, "leaves": ("3", "4")}
-    masks = SimpleNamespace(instance_ids=torch.tensor([1, 4]), classes=torch.tensor([1, 2]))  # 4 is a stem
-    finding = _find_doubtful(SimpleNamespace(surfaces=surfaces, masks=masks), has_stems=True)  # type: ignore[arg-type]
+    finding = _find_doubtful(surfaces, [4])
     assert finding.values == {"count": 1, "total": 3, "leaves": ("3",)}
-    assert _find_doubtful(SimpleNamespace(surfaces={1: surfaces[2]}), has_stems=False) is None  # type: ignore[arg-type]
+    assert _find_doubtful({1: surfaces[2]}, []) is None

@@ -93,7 +93,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 3)], [(0, 1)])).instance_ids, True),
     "match_masks": (lambda r, c, i: match_masks(masks_of(r, i), c, links=Links.of()).match_scores, True),
     "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
-    "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).close_gaps().count_sure_views(), True),
+    "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).count_sure_views(), True),
     "LeafSurface": (lambda r, c, i: surfaces()[1].project(c)[0], True),
     "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),
     "choose_leaves": (

@@ -14,7 +14,7 @@ from mvseg.checks.numbers import CAMERAS
 from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
-from mvseg.verification.numbers import ROUGH
+from mvseg.verification.numbers import EVIDENCE
 
 DEPTHS = np.geomspace(0.02, 500, 80)  # depths of candidate points, in the median distance of two cameras
 GRID = (0.25, 0.5, 0.75)  # chosen: places of rays with candidate points, in the photo's width and height
@@ -94,7 +94,7 @@ def _baseline_rules(cameras: Cameras, coverage: Coverage) -> list[Rule]:
     twins = torch.triu(is_coincident(cameras), diagonal=1).nonzero().flatten().unique().tolist()
     rules: list[Rule] = [("same_position", "warning", twins, {})]
     walked = _widest_angle(cameras, coverage)
-    if coverage.sees.sum() > 1 and walked < ROUGH.least_parallax:
+    if coverage.sees.sum() > 1 and walked < EVIDENCE.least_parallax:
         rules.append(("no_depth" if walked < CAMERAS.narrow else "one_sided", "warning", None, {"degrees": walked}))
     angle = np.nan_to_num(coverage.angle)
     lonely = np.flatnonzero(angle > CAMERAS.wide).tolist()

@@ -6,17 +6,27 @@ whole instances (`everywhere`) waits until they are known: see `mvseg.correction
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.corrections.corrected import APPLIED, CONTRADICTED, NOTHING, PASSED, Corrected, Fate, RejectedPixel, Whole
+from mvseg.corrections.corrected import (
+    APPLIED,
+    CONTRADICTED,
+    NOTHING,
+    PASSED,
+    Corrected,
+    Fate,
+    RejectedPixel,
+    Whole,
+    keep_latest,
+)
 from mvseg.corrections.edited_mask import EditedMask, Key, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.corrections.numbers import EDITS
@@ -54,10 +64,10 @@ class _Edited:
         masks: in the order in which they are drawn.
         fates: {number of the edit: its fate}.
         ties: between masks, some of which may be gone.
-        everywhere: what edits say of whole instances.
+        everywhere: about whole instances.
         words: (word for a leaf, edit, mask outlined with it).
         rejected: masks rejected in one photo, and by which edit.
-        refused: pixels where the user says that no leaf is, and where no mask is.
+        refused: rejected pixels in no mask.
     """
 
     masks: tuple[EditedMask, ...]
@@ -106,9 +116,8 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     """Apply edits to the masks of a scene, one after the other. An edit that points at nothing changes nothing.
 
     Args:
-        corrections: the edits; those that link dates are passed over.
-        masks: D masks, detected or given; what is known of their instances is forgotten.
-        scene: their scene. Points and polygons of the edits are in its photos' own pixels, with distortion.
+        corrections: edits; links of dates are passed over. Points are in the photos' own pixels, with distortion.
+        masks: D masks, detected or given; their ids are forgotten.
 
     Returns:
         The masks, without those that were rejected or that an outline replaced, and the links. Masks that the user
@@ -119,9 +128,11 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     edited = _Edited(tuple(EditedMask((0, n), view, masks.regions.placed(n), n, origin)
                            for n, (view, origin) in enumerate(rows)))  # fmt: skip
     for number, edit in enumerate(corrections.edits, start=1):
-        passed = edited.with_fate(Fate(number, edit.op, PASSED if isinstance(edit, TrackLink) else APPLIED))
+        if isinstance(edit, TrackLink):
+            edited = edited.with_fate(Fate(number, edit.op, PASSED))
+            continue
         try:
-            edited = _apply_one(passed, number, edit, scene)
+            edited = APPLY[type(edit)](edited.with_fate(Fate(number, edit.op, APPLIED)), number, edit, scene)
         except _Lost as error:
             edited = edited.with_fate(Fate(number, edit.op, NOTHING, str(error)))
     order = sorted(_clear_outlines(edited.masks), key=lambda mask: mask.view)
@@ -160,20 +171,12 @@ def is_on(edit: Edit, regions: Regions, rows: Sequence[int], *, scene: Scene) ->
     return False
 
 
-def _apply_one(edited: _Edited, number: int, edit: Edit, scene: Scene) -> _Edited:
-    if isinstance(edit, Outline):
-        return _outline(edited, number, edit, scene)
-    if isinstance(edit, Reject):
-        return _reject(edited, number, edit, scene)
-    if isinstance(edit, Confirm):
-        edited, mask = _remaining_mask_at(edited, number, (edit.view, *edit.at), scene)
-        origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
-        edited = edited.with_edit(number, {mask.key}, origin=origin)
-        about = (_About(number, mask.key, False),) if edit.everywhere else ()
-        return replace(edited, everywhere=(*edited.everywhere, *about))
-    if isinstance(edit, Split):
-        return _split(edited, number, edit, scene)
-    return _link(edited, number, edit, scene) if isinstance(edit, Link) else edited
+def _confirm(edited: _Edited, number: int, edit: Confirm, scene: Scene) -> _Edited:
+    edited, mask = _remaining_mask_at(edited, number, (edit.view, *edit.at), scene)
+    origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
+    edited = edited.with_edit(number, {mask.key}, origin=origin)
+    about = (_About(number, mask.key, False),) if edit.everywhere else ()
+    return replace(edited, everywhere=(*edited.everywhere, *about))
 
 
 def _outline(edited: _Edited, number: int, edit: Outline, scene: Scene) -> _Edited:
@@ -247,6 +250,11 @@ def _link(edited: _Edited, number: int, edit: Link, scene: Scene) -> _Edited:
     return replace(edited.with_edit(number, keys), ties=(*edited.ties, *ties))
 
 
+APPLY: dict[type, Callable[[_Edited, int, Any, Scene], _Edited]] = {
+    Outline: _outline, Reject: _reject, Confirm: _confirm, Split: _split, Link: _link
+}  # fmt: skip
+
+
 def _clear_outlines(masks: Sequence[EditedMask]) -> list[EditedMask]:
     """A pixel shows one leaf: what lies in an outline is taken from every mask drawn before it."""
     cleared = list(masks)
@@ -285,8 +293,7 @@ def _tell_of_parts(edited: _Edited, masks: Sequence[EditedMask], component: NDAr
 
 
 def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited, Links]:
-    """The links that hold, of rows: the latest first, and none that contradicts those. The edit of one that does not
-    hold is contradicted by the latest edit without which it would; or by itself."""
+    """The links that hold, of rows, see `keep_latest`."""
     ties = [each for each in edited.ties if each.one in place and each.other in place]
 
     def links_of(edits: Collection[int]) -> Links | None:
@@ -301,20 +308,10 @@ def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited,
         return None
 
     edits = sorted({each.edit for each in ties}, reverse=True)
-    if (links := links_of(edits)) is not None:
-        return edited, links
-    held: list[int] = []
-    links = Links.of()
-    for number in edits:
-        agreeing = links_of([*held, number])
-        if agreeing is not None:
-            links, held = agreeing, [*held, number]
-        elif links_of([number]) is None:
-            edited = edited.contradict(number, [number])
-        else:
-            culprits = (later for later in held if links_of({number, *held} - {later}) is not None)
-            edited = edited.contradict(next(culprits, max(held)), [number])
-    return edited, links
+    held, losers = keep_latest(edits, lambda chosen: links_of(chosen) is not None)
+    for number, winner in losers.items():
+        edited = edited.contradict(winner, [number])
+    return edited, links_of(held) or Links.of()
 
 
 def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -35,14 +36,8 @@ class Fate:
 
 @dataclass(frozen=True)
 class RejectedPixel:
-    """A pixel where the user says that no leaf is, and where no mask is: it may be the answer to a question, see
-    `settle`.
-
-    Attributes:
-        edit: its number.
-        view, column, row: of the undistorted photo.
-        everywhere: no leaf in any photo.
-    """
+    """A pixel of an undistorted photo in no mask, where the user says that no leaf is, or none in any photo
+    (`everywhere`): it may be the answer to a question, see `settle_edits`."""
 
     edit: int
     view: int
@@ -68,9 +63,9 @@ class Corrected:
         masks: D masks on the CPU, by view, matched to nothing.
         links: of their rows. Besides those of edits, links keep outlines apart from the other masks of their photos.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
-        everywhere: the edits about whole instances.
-        refused: pixels that the user rejects and that lie in no mask.
-        fates: of the edits, in their order.
+        everywhere: about whole instances.
+        refused: rejected pixels in no mask.
+        fates: in the order of the edits.
     """
 
     masks: Masks
@@ -81,17 +76,30 @@ class Corrected:
     fates: tuple[Fate, ...]
 
 
-def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
-    """Edits about whole instances, once these are known, in the order of the list.
+def keep_latest(edits: Sequence[int], holds: Callable[[Collection[int]], bool]) -> tuple[list[int], dict[int, int]]:
+    """Edits (latest first) that hold together, and {other edit: the latest without which it would hold, or itself}."""
+    if holds(edits):
+        return list(edits), {}
+    held: list[int] = []
+    losers: dict[int, int] = {}
+    for number in edits:
+        if holds([*held, number]):
+            held.append(number)
+        elif not holds([number]):
+            losers[number] = number
+        else:
+            culprits = (later for later in held if holds({number, *held} - {later}))
+            losers[number] = next(culprits, max(held))
+    return held, losers
 
-    Args:
-        corrected: what came of all other edits.
-        matched: its masks with ids, in their order.
+
+def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
+    """Edits about whole instances, once `matched` has the ids, in the order of the list.
 
     Returns:
-        The masks, with ids without gaps: those of a rejected instance go, but for those that later edits drew, cut or
-        confirmed; those of a confirmed one are confirmed. And the same with the final fates: such an edit contradicts
-        earlier ones that drew, cut or confirmed masks that now go, or that rejected what it confirms.
+        The masks: a rejected instance goes, except masks that later edits drew, cut or confirmed; a confirmed one is
+        confirmed. And the final fates: such an edit contradicts earlier ones that drew, cut or confirmed masks that
+        now go, or that rejected what it confirms.
     """
     ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)  # the edit by which each mask goes
     confirmed, last_edits = torch.zeros(len(matched), dtype=torch.bool), corrected.last_edits
@@ -115,5 +123,5 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
         for each in corrected.fates
     )
     origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
-    masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
+    masks = replace(matched, origin=origin).select(goes == 0)
     return masks, replace(corrected, fates=fates)

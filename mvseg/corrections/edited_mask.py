@@ -22,8 +22,7 @@ Key = tuple[int, int]  # of a mask: the edit that made it, or 0, and which of it
 
 @dataclass(frozen=True, eq=False)
 class EditedMask:
-    """One mask while edits are applied: its key, the row of the table it began as (-1: none) and the edits that made
-    it."""
+    """One mask while edits are applied: the `row` of the table that it was (-1: none), the `edits` that made it."""
 
     key: Key
     view: int

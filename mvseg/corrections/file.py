@@ -112,7 +112,6 @@ class Corrections:
     """Edits in their order: a later one wins.
 
     Attributes:
-        edits: in the order of the file.
         source: the file that they were read from, for messages; None in memory.
         photos: {view: mark} of the photos that they were made for; empty if unknown.
     """
@@ -123,11 +122,7 @@ class Corrections:
 
 
 def load_corrections(path: Path | str) -> Corrections:
-    """Read a file of corrections.
-
-    Raises:
-        InputError: the file is missing, too large or not JSON; see `parse_corrections`.
-    """
+    """Read a file of corrections. Raises InputError: it is missing, too large or not JSON; see `parse_corrections`."""
     path = Path(path)
     return parse_corrections(load_json(path, most=EDITS.most_bytes), source=path)
 

@@ -1,7 +1,6 @@
-"""The user who says that two halves show one leaf says so of all photos. Not in the paper.
+"""Extend a link between two halves of a leaf to all photos. Not in the paper.
 
-Where masks show a leaf in two halves in many photos, each half is an instance of its own. A link would join the two
-linked masks, and leave the others to either half.
+Where masks show a leaf in two halves in many photos, each half is an instance of its own.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from torch import Tensor
 from mvseg.corrections.corrected import Corrected
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
-from mvseg.masks import Masks
 from mvseg.matching.links import Links
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -26,33 +24,26 @@ from mvseg.scene import Cameras
 
 
 def link_halves(corrected: Corrected, ids: Tensor, cameras: Cameras) -> Corrected:
-    """The masks as edits leave them, with the links that follow between halves of a leaf.
+    """Link the halves of a leaf (`are_one_leaf`) in each photo that shows both, if a link joins masks of the two
+    instances.
 
-    A link that joins masks of two instances is about all of their masks where several photos show both, and one surface
-    shows the masks of both as well as two do (`are_one_leaf`): then both are linked in each of these photos. Elsewhere
-    it says that one mask has the wrong id, and the two instances are two leaves.
-
-    Args:
-        corrected: D masks and their links.
-        ids: (D,) int64, the leaves that they showed before the edits.
-
-    Returns:
-        The same with more links; a link that would contradict those of the user is left out.
-    """
+    Elsewhere the link says that one mask has the wrong id, and the two instances are two leaves. A link that would
+    contradict those of the user is left out. `ids` (D,) int64: the leaves before the edits."""
     masks, links = corrected.masks, corrected.links
     if not len(links.must):
         return corrected
     is_linked = masks.is_linked
     for one, other in sorted({(min(pair), max(pair)) for pair in ids[links.must].tolist()}):
-        halves = _in_one_photo(masks, ids == one, ids == other) if 0 < one < other else []
-        if len({int(masks.view_index[row]) for row, _ in halves}) < EDITS.least_halves:
-            continue
         own = torch.where(ids == one, 1, torch.where(ids == other, 2, -1))
+        is_pair = (own[:, None] == 1) & (own == 2) & (masks.view_index[:, None] == masks.view_index)
+        halves = is_pair.nonzero()
+        if not 0 < one < other or len(masks.view_index[halves[:, 0]].unique()) < EDITS.least_halves:
+            continue
         if are_one_leaf(masks.regions, own, cameras):
-            more = Links(torch.cat((links.must, torch.tensor(halves))), links.cannot)
+            more = Links(torch.cat((links.must, halves)), links.cannot)
             with suppress(InputError):
                 more.components(len(masks))
-                links, is_linked = more, is_linked | Links.of(halves).named(len(masks))
+                links, is_linked = more, is_linked | Links.of(halves.tolist()).named(len(masks))
     return replace(corrected, links=links, masks=replace(masks, is_linked=is_linked))
 
 
@@ -72,11 +63,8 @@ def _touches(one: LeafSurface, other: LeafSurface) -> bool:
 
 
 def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
-    """Whether it is credible, its median IoU that of the worst of the parts or more, and its outline as near to those
-    of the masks.
-
-    The IoU alone would forgive a larger surface: outlines that are as uncertain take a smaller share of it.
-    """
+    """Whether a joint surface is credible, its median IoU at least that of the worst part, and its outline as near to
+    the masks: the IoU alone would forgive a larger surface."""
     worst = min(float(part.iou.median()) for part in parts)
     farthest = max(_outline_px(part) for part in parts)
     return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= EDITS.as_near * farthest
@@ -85,9 +73,3 @@ def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
 def _outline_px(surface: LeafSurface) -> float:
     """Root mean square distance between its outline and those of its masks, over the views with both."""
     return float(surface.residual_px.square().nanmean().sqrt())
-
-
-def _in_one_photo(masks: Masks, is_one: Tensor, is_other: Tensor) -> list[tuple[int, int]]:
-    first, second = is_one.nonzero()[:, 0].tolist(), is_other.nonzero()[:, 0].tolist()
-    views = masks.view_index.tolist()
-    return [(row, other) for row in first for other in second if views[row] == views[other]]

@@ -8,14 +8,13 @@ from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Literal
 
-import cv2
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
-from mvseg.arrays import Bools, Ints
+from mvseg.arrays import Bools, Floats, Ints
 from mvseg.corrections.numbers import QUESTIONS
+from mvseg.corrections.rough_outline import trace_outline
 from mvseg.corrections.unmasked import Unmasked, find_unmasked
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
@@ -27,7 +26,7 @@ from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
 FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow
-Outlines = tuple[tuple[int, NDArray[np.float64]], ...]
+Outlines = tuple[tuple[int, Floats], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +86,8 @@ def list_mask_questions(
         photos: photos of the views; None: nobody looks for places without masks.
     """
     masks, surfaces_of, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
-    questions = _ask_matches(masks)
+    usual, areas = _usual_area(masks), masks.regions.areas.tolist()
+    questions = _ask_matches(masks, usual)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
     evidence = see_instances(masks.regions, surfaces_of, cameras)
     free: list[list[int]] = [[] for _ in rejected]  # rows of each candidate's masks where none of the result lies
@@ -99,7 +99,6 @@ def list_mask_questions(
         for rows, candidate in zip(free, rejected, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
     questions += _ask_surfaces(masks, surfaces_of) + _ask_rare(masks, should)
-    usual, areas = _usual_area(masks), masks.regions.areas.tolist()
     if photos is not None:
         questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=QUESTIONS.half * usual), usual=usual)
     questions = [
@@ -135,9 +134,8 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
     return int(rows[torch.where(scores >= scores.max() - QUESTIONS.as_good, masks.regions.areas[rows], -1).argmax()])
 
 
-def _ask_matches(masks: Masks) -> list[MaskQuestion]:
+def _ask_matches(masks: Masks, usual: float) -> list[MaskQuestion]:
     ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
-    usual = _usual_area(masks)
     questions = []
     for row, score in enumerate(masks.match_scores.tolist()):
         if ids[row] > 0:
@@ -202,7 +200,7 @@ def _ask_rejected(
         areas = regions.areas[rows].double()
         order = areas.argsort(descending=True, stable=True).tolist()
         outlines = tuple(
-            (int(regions.view_index[row]), _outline(regions.crop(row).numpy(), regions.boxes[row, :2].tolist()))
+            (int(regions.view_index[row]), trace_outline(regions.crop(row).numpy()) + regions.boxes[row, :2].numpy())
             for row in (rows[place] for place in order)
         )
         doubt = each.chance * min(1.0, float(areas.median()) / usual)
@@ -236,18 +234,10 @@ def _ask_view(
             doubt = min(1.0, float(evidence.visible[nearest, instance]) / QUESTIONS.surely)
             questions.append(MaskQuestion("covered", doubt, view, instance, region=nearest))
         elif empty >= QUESTIONS.empty:
-            outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
+            outlines = ((view, trace_outline(mask) + (box[1].start, box[0].start)),)
             size = min(1.0, float(mask.sum()) / _usual_area(masks))
             questions.append(MaskQuestion("missing", empty * share, view, instance, outlines=outlines, size=size))
     return questions
-
-
-def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
-    """(P, 2) the largest component of a mask (h, w), cut out at a corner x, y, as a polygon; pixels."""
-    lines, _ = cv2.findContours(crop.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    longest = max(lines, key=cv2.contourArea)
-    points = cv2.approxPolyDP(longest, QUESTIONS.smooth_px, True)[:, 0]
-    return np.asarray(points + np.array(corner) + 0.5, dtype=np.float64)
 
 
 def _ask_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[MaskQuestion]:

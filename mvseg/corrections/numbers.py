@@ -29,7 +29,7 @@ class EditNumbers:
     least_pixels: int = 16  # chosen: min. pixels of that part within the rough outline
     rounds: int = 5  # limit: rounds of GrabCut
     least_leaf: float = 0.05  # chosen: min. size of the leaf, as a share of the rough outline's pixels
-    tolerance_px: float = 1.0  # chosen: distance of the outline from the leaf's edge, pixels of the part
+    tolerance_px: float = 1.0  # chosen: max. distance of an outline from the edge that it follows
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,11 @@ class QuestionNumbers:
     empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one
     surely: float = 0.8  # chosen: the same, from which nothing else is likelier
-    smooth_px: float = 1.5  # chosen: max. distance of a proposed outline from the edge that it follows
     least_chance: float = 0.1  # chosen: P from which a candidate that was not chosen is asked about
     half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
     least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf
     most_places: int = 12  # limit: max. places that one question shows
-    search_px: int = 600  # limit: longer side of a photo in which places are looked for
-    opening: int = 5  # chosen: min. width of a place in these pixels: stems are thinner, and seams beside masks
+    opening: int = 5  # chosen: min. width of a place, pixels of the picture: stems are thinner, and seams beside masks
     compact: float = 0.25  # chosen: min. square of its largest width, as a share of its area: stems have less
     beside: int = 3  # chosen: max. distance between a mask and what it leaves out of its leaf, in these pixels
     most_share: float = 0.2  # chosen: size of a place, relative to the photo; of larger ones the widest place

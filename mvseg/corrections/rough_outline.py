@@ -5,21 +5,22 @@ GrabCut (Rother, Kolmogorov, Blake 2004), as OpenCV has it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.arrays import Floats, Pixels
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
+from mvseg.verification.snap_edges import cut_by_color
 
-Points = NDArray[np.float64]
 
-
-def refine_outline(photo: NDArray[np.uint8], rough: Points) -> Points:
-    """Refine a rough outline.
+def refine_outline(photo: Pixels, rough: Floats) -> Floats:
+    """Refine a rough outline in a photo (H, W, 3) uint8 RGB.
 
     Args:
-        photo: (H, W, 3) uint8 RGB.
         rough: (P, 2) x, y of corners around the leaf, P >= 3, pixels with centres at half integers. Nothing outside it
             can be leaf.
 
@@ -43,15 +44,16 @@ def refine_outline(photo: NDArray[np.uint8], rough: Points) -> Points:
     if inside.sum() < EDITS.least_pixels or inside.all():
         raise InputError("the rough outline is too small or as large as the photo, expected one around a leaf")
     state = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
-    cv2.setRNGSeed(0)
-    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-    how = EDITS.rounds, cv2.GC_INIT_WITH_MASK
-    cv2.grabCut(part, state, None, background, foreground, *how)  # type: ignore[call-overload]
-    leaf = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.uint8)
-    leaf = cv2.morphologyEx(leaf, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    lines, _ = cv2.findContours(leaf, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    largest = max(lines, key=cv2.contourArea, default=None)
-    if largest is None or cv2.contourArea(largest) < EDITS.least_leaf * inside.sum():
+    grown = cut_by_color(part, state, rounds=EDITS.rounds).astype(np.uint8)
+    leaf = cv2.morphologyEx(grown, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    corners = trace_outline(leaf) if leaf.any() else np.zeros((1, 2))
+    if cv2.contourArea(corners.astype(np.float32)) < EDITS.least_leaf * inside.sum():
         raise InputError("nothing inside differs from what is around it, expected an outline drawn by hand here")
-    corners = cv2.approxPolyDP(largest, EDITS.tolerance_px, True)[:, 0]
-    return np.asarray((corners + 0.5) / scale + (x1, y1), dtype=np.float64)
+    return np.asarray(corners / scale + (x1, y1), np.float64)
+
+
+def trace_outline(mask: NDArray[Any]) -> Floats:
+    """(P, 2) x, y of corners: the largest component of a mask (h, w) with a pixel or more, as a polygon."""
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    corners = cv2.approxPolyDP(max(lines, key=cv2.contourArea), EDITS.tolerance_px, True)[:, 0]
+    return np.asarray(corners + 0.5, np.float64)

@@ -57,9 +57,7 @@ def _names(edit: Edit) -> list[str]:
 
 def check_made_for(corrections: Corrections, photos: Photos) -> None:
     """Check that the photos are those that the corrections were made for; views that the scene does not have are left
-    to `apply`.
-
-    Warns (InputWarning) of a file that does not say which photos it was made for.
+    to `apply`. Warns (InputWarning) of a file that does not say which photos it was made for.
 
     Raises:
         InputError: a photo is another one, or of another size.

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
+from mvseg.corrections.corrected import keep_latest
 from mvseg.corrections.file import Edit, TrackLink
 from mvseg.formats.find_views import base_name
 from mvseg.formats.label_png import read_labels
@@ -54,28 +55,14 @@ def find_links(
                 problems[index] = f"{edit.op}: leaf {flat[0][1]} of {flat[0][0]} has no shape, so nothing can be linked"
             else:
                 links[index] = LeafLink(edit.op == "same_track", tuple(leaves))
-    kept = _without_contradicted(links, problems)
-    return [links[index] for index in sorted(kept)], problems
-
-
-def _without_contradicted(links: Mapping[int, LeafLink], problems: dict[int, str]) -> list[int]:
-    """The places of the links that hold together, the last one first; `problems` learns the others."""
-    agreeing: list[int] = []
-    for index in sorted(links, reverse=True):
-        link = links[index]
-        if not _is_contradiction([link, *(links[other] for other in agreeing)]):
-            agreeing.append(index)
-        elif _is_contradiction([link]):
-            problems[index] = f"{_op(link)}: two leaves of one date, which are never the same"
-        else:
-            held = [links[k] for k in agreeing]
-            count = next(n for n in range(len(held)) if _is_contradiction([link, *held[: n + 1]]))
-            problems[index] = f"{_op(link)}: contradicted by edit {agreeing[count] + 1}"
-    return agreeing
-
-
-def _op(link: LeafLink) -> str:
-    return "same_track" if link.is_same else "different_track"
+    latest = sorted(links, reverse=True)
+    held, losers = keep_latest(latest, lambda chosen: not _is_contradiction([links[index] for index in chosen]))
+    for index, winner in losers.items():
+        op = "same_track" if links[index].is_same else "different_track"
+        is_own = winner == index
+        why = "two leaves of one date, which are never the same" if is_own else f"contradicted by edit {winner + 1}"
+        problems[index] = f"{op}: {why}"
+    return [links[index] for index in sorted(held)], problems
 
 
 def _is_contradiction(links: Sequence[LeafLink]) -> bool:

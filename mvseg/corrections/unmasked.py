@@ -7,54 +7,39 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from mvseg.arrays import Bools, Ints
+from mvseg.arrays import Bools, Floats
 from mvseg.corrections.numbers import QUESTIONS
+from mvseg.corrections.rough_outline import trace_outline
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
-from mvseg.verification.leaf_color import has_leaf_color, thin_views
+from mvseg.verification.picture import FREE, Labels, draw_pictures
 
 
 @dataclass(frozen=True, eq=False)
 class Unmasked:
-    """One part.
-
-    Attributes:
-        view: index of the view.
-        row: row of the mask that it shares its longest border with, -1 for none.
-        area: pixels.
-        outline: (P, 2) float64 pixels, undistorted.
-    """
+    """One part: its view, the row of the mask that it shares its longest border with (-1: none), its area in pixels,
+    and its outline (P, 2), pixels, undistorted."""
 
     view: int
     row: int
     area: float
-    outline: NDArray[np.float64]
+    outline: Floats
 
 
 def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list[Unmasked]:
-    """The parts of at least `least_area` pixels, by view; none where nothing is matched, whose colours tell what leaves
-    look like. What is long and thin like a stem is left out. Of a very large part, or one that reaches the edge of the
-    photo, its widest place counts: several leaves hang together there, or the ground.
-
-    Args:
-        masks: D masks on the CPU, matched.
-    """
+    """Find parts of at least `least_area` pixels, by view; none where nothing is matched, whose colours tell what
+    leaves look like. Long and thin parts, like stems, are left out. Of a very large part, or one that reaches the edge
+    of the photo, the widest place counts: several leaves hang together there, or the ground."""
     if not masks.num_instances:
         return []
-    views, colors = thin_views(masks, photos, most_px=QUESTIONS.search_px)
-    return [
-        part
-        for view, (photo, rows, step) in enumerate(views)
-        for part in _parts(
-            has_leaf_color(photo, colors) & (rows < 0), rows, view=view, step=step, least_area=least_area
-        )
-    ]
+    pictures = enumerate(draw_pictures(masks, photos))
+    return [part for view, (rows, step) in pictures for part in _parts(rows, view, step=step, least_area=least_area)]
 
 
-def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: float) -> Iterator[Unmasked]:
-    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((QUESTIONS.opening,) * 2, np.uint8))
+def _parts(rows: Labels, view: int, *, step: int, least_area: float) -> Iterator[Unmasked]:
+    is_free, kernel = (rows == FREE).astype(np.uint8), np.ones((QUESTIONS.opening,) * 2, np.uint8)
+    opened = cv2.morphologyEx(is_free, cv2.MORPH_OPEN, kernel)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
     (height, width), beside = rows.shape, QUESTIONS.beside
     for label in range(1, count):
@@ -74,14 +59,12 @@ def _parts(is_free: Bools, rows: Ints, *, view: int, step: int, least_area: floa
             continue
         touched = rows[box][cv2.dilate(part, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0]
         touching, numbers = np.unique(touched[touched >= 0], return_counts=True)
-        lines, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        outline = cv2.approxPolyDP(max(lines, key=cv2.contourArea), 1.0, True)[:, 0]
         corner = np.array([box[1].start, box[0].start])
         yield Unmasked(
             view=view,
             row=int(touching[numbers.argmax()]) if len(touching) else -1,
             area=float(area * step**2),
-            outline=np.asarray((outline + corner + 0.5) * step, np.float64),
+            outline=(trace_outline(part) + corner) * step,
         )
 
 

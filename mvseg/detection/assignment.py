@@ -55,11 +55,10 @@ def ruzicka_similarity(
 ) -> Tensor:
     """Ruzicka similarity of every proposal's mask with every instance's epipolar map in its view (Eqs. 4, 5).
 
-    With a map M in [0, 1] and a mask A of 0 and 1, sum min(M, A) is the sum of M over the mask, and
-    sum max = sum M + |A| - sum min: no map is ever drawn.
+    With a map M in [0, 1] and a mask A of 0 and 1, sum min(M, A) is the sum of M over the mask, and sum max = sum M +
+    |A| - sum min: no map is ever drawn.
 
     Args:
-        proposals: R masks in V views.
         instance_ids: (D,) int64 in [1, K] or -1.
         max_pixels: thins the masks of the proposals; None takes all pixels.
 

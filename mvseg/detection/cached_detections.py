@@ -2,8 +2,7 @@
 
 One .safetensors file per photo, in a folder that `mvseg infer` deletes when the result is there, and that `mvseg batch`
 keeps for the next batch. Its name is a hash of everything that the detections depend on: the photo, its camera, the
-weights and the options. A changed photo or option gets another name, so that detections are used again only where they
-would be the same. A hidden file says whose photos they are of.
+weights and the options. A hidden file says whose photos they are of.
 """
 
 from __future__ import annotations
@@ -32,12 +31,8 @@ FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 @dataclass(frozen=True, eq=False)
 class CachedDetections:
-    """Cache of the detections of a run.
-
-    Attributes:
-        folder: of the files; made with the first of them.
-        used: names of the files that this run has asked for; the others are of other photos, detectors or options.
-    """
+    """Cache of the detections of a run: its folder, made with the first file, and the names of the files that this run
+    has `used`; the others are of other photos, detectors or options."""
 
     folder: Path
     used: set[str] = field(default_factory=set)
@@ -79,8 +74,7 @@ def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
 
 
 def read_detections(path: Path) -> dict[str, Tensor] | None:
-    """Read detections as `write_detections` wrote them, the same bits; None where there is nothing, or something
-    else."""
+    """Read detections of `write_detections`, the same bits; None where there is nothing, or something else."""
     try:
         detections = safetensors.torch.load(path.read_bytes())
     except (OSError, safetensors.SafetensorError):
@@ -117,13 +111,12 @@ def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterat
         with lock_folder(folder):
             try:
                 owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
-                earlier = owner.read_bytes() if owner.is_file() else place
-                if not owner.is_file() and _holds_some(folder) and not overwrite:
-                    message = "holds detections, but not of which photos, expected another --out, or --overwrite true"
-                    raise InputError(f"{folder}: {message}")
+                earlier = owner.read_bytes() if owner.is_file() else b"" if _holds_some(folder) else place
                 if earlier != place and not overwrite:
-                    message = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}, not of"
-                    raise InputError(f"{folder}: {message} {scene}; expected another --out, or --overwrite true")
+                    other, why = os.fsdecode(earlier), "holds detections, but not of which photos"
+                    if other:
+                        why = f"keeps what a run that was cut off found in the photos of {other}, not of {scene}"
+                    raise InputError(f"{folder}: {why}; expected another --out, or --overwrite true")
                 write_whole(owner, lambda partial: partial.write_bytes(place))
                 yield _holds_some(folder)
             finally:

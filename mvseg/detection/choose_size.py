@@ -1,8 +1,7 @@
-"""At which size the detector sees the leaves of a plant best: the views decide.
+"""At which size the detector sees the leaves of a plant best: the views decide. Not in the paper.
 
-A detector knows leaves of some sizes in pixels. Which those are on a new plant, its scores do not tell; whether the
-views agree does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md); its
-degenerate optimum, the whole plant as one leaf, `order_ratings` excludes. Not in the paper.
+A detector knows leaves of some sizes in pixels. Scores do not reveal which sizes work on a new plant; agreement between
+views does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md).
 """
 
 from __future__ import annotations
@@ -15,7 +14,8 @@ from mvseg.verification.leaf_scores import order_ratings
 
 
 def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[PassResult]:
-    """Look again and again at a smaller size, as long as the agreed area grows.
+    """Look again and again at a smaller size, as long as the agreed area grows; return one pass, or two, see
+    `order_sizes`.
 
     Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), it takes more sizes
     without growth (`DETECTION.patience`): there, agreed areas of neighbouring sizes differ by chance.
@@ -23,11 +23,8 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
     Args:
         see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
         first: the pass at the usual size.
-
-    Returns:
-        One pass, or two that are nearly as good, see `order_sizes`.
     """
-    results, size, num_misses = [first], float(first.passes[0].longest), 0
+    results, size, num_misses = [first], float(first.detected.longest), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
         best = order_sizes(results)[0]
         results.append(see(round(size)))
@@ -39,14 +36,7 @@ def choose_size(see: Callable[[int], PassResult], first: PassResult) -> list[Pas
 
 def choose_near(see: Callable[[int], PassResult], size: int, *, most: int) -> list[PassResult]:
     """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
-
-    Args:
-        see: finds leaves at a size, see `choose_size`.
-        most: pixels, the longer side of the photos: no size is larger.
-
-    Returns:
-        One pass, or two that are nearly as good, see `order_sizes`.
-    """
+    `most`: the longer side of the photos, pixels. Returns as `choose_size`."""
     larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
     sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
     return order_sizes([see(each) for each in sizes])

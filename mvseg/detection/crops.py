@@ -1,7 +1,4 @@
-"""Where the plant is in every photo, once its leaves are matched: a second pass sees it larger.
-
-Not in the paper.
-"""
+"""Where the plant is in every photo, once its leaves are matched: a second pass sees it larger. Not in the paper."""
 
 from __future__ import annotations
 
@@ -71,13 +68,8 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
 
 
 def gain_of_crops(boxes: Tensor, sizes: Tensor, longest: int) -> Tensor:
-    """(V,) float64, how many times larger a detector sees crops than whole photos, without enlarging their pixels.
-
-    Args:
-        boxes: (V, 4) xyxy of the crops.
-        sizes: (V, 2) width and height of the photos.
-        longest: the longer side, pixels, to which the detector scales larger images down.
-    """
+    """(V,) float64, how many times larger a detector sees crops (V, 4) xyxy than whole photos (V, 2), if it only scales
+    larger images down, to a longer side of `longest` pixels."""
     crops = (boxes[:, 2:] - boxes[:, :2]).amax(1)
     of_crop, of_photo = (longest / side.double().clamp(min=longest) for side in (crops, sizes.amax(1)))
     return of_crop / of_photo

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -35,21 +36,15 @@ def detect_scene(
 ) -> Pass:
     """Look for instances in every photo, and again, larger, where the plant fills a small part of the photos.
 
-    Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
+    Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps. Warns
+    (InputWarning) of more proposals than are taken: a detector that knows nothing proposes masks everywhere.
 
     Args:
-        photos: of the scene, with its cameras.
-        config: which detector, at which size, and what it finds.
         boxes: (V, 4) int64 xyxy, the parts of the photos that show the plant, from an earlier pass; None: look for it.
-
-    Returns:
-        The pass, matched with the cameras of the photos. Warns (InputWarning) of photos of more proposals than are
-        taken: a detector that knows nothing proposes masks everywhere, each of which the views would have to judge.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
-    cameras = photos.scene.cameras
     least = min(DETECTION.least_score, config.min_score) if config.verify else config.min_score
     detector = load_detector(config.weights, image_size=config.image_size, min_score=least)
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -61,14 +56,11 @@ def detect_scene(
     ).to(device)
     made_by = describe_detector(config, model, device)
 
-    def run_pass(boxes: Tensor | None) -> Pass:
-        found = _detect(model, photos, boxes, cache=cache, made_by=made_by)
-        return Pass.of(model, found, cameras, boxes=boxes, min_score=config.min_score)
-
-    detected = run_pass(boxes)
+    detect = partial(_detect, model, photos, min_score=config.min_score, cache=cache, made_by=made_by)
+    detected = detect(boxes)
     if boxes is None and config.crop == "auto":
-        boxes = boxes_for_second_pass(detected.sure.masks, cameras, longest=model.transform.max_size)
-        detected = detected if boxes is None else run_pass(boxes)
+        boxes = boxes_for_second_pass(detected.sure.masks, detected.cameras, longest=model.transform.max_size)
+        detected = detected if boxes is None else detect(boxes)
     if num_full := sum(len(each["scores"]) >= DETECTION.most_proposals for each in detected.detections):
         values = {"count": num_full, "most": DETECTION.most_proposals}
         warn(Finding("very_many_proposals", values=values))
@@ -80,10 +72,11 @@ def _detect(
     photos: Photos,
     boxes: Tensor | None,
     *,
+    min_score: float,
     cache: CachedDetections | None,
     made_by: str,
-) -> list[dict[str, Tensor]]:
-    """Detections in every photo, or in its box (V, 4) xyxy."""
+) -> Pass:
+    """One pass over every photo, or its box (V, 4) xyxy."""
     every, scene = [], photos.scene
     device = next(model.parameters()).device
     with timed("detect"):
@@ -99,7 +92,7 @@ def _detect(
                 if path is not None:
                     write_detections(path, detections)
             every.append(detections)
-    return every
+    return Pass(model.match_detections, every, scene.cameras, min_score, boxes)
 
 
 def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:

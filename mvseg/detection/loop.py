@@ -34,15 +34,14 @@ def match_proposals(
 
     Args:
         proposals: R scored masks of V views, the excessive set; objects of different classes are never matched.
-        cameras: V cameras on the same device.
-        boxes: (R, 4) float32 xyxy, what NMS compares; None: those of the masks.
+        boxes: (R, 4) float32 xyxy for NMS; None: those of the masks.
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
-        detections_per_view: at most this many are kept in a view, best scores first.
+        detections_per_view: max. number, best scores first.
         residual_px: the reprojection error, where an earlier matching with these cameras has found it; None: estimated.
 
     Returns:
-        The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
-        what `match_masks` says of it; what that said of earlier rounds is forgotten.
+        The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns as
+        the last `match_masks` does.
     """
     if not len(proposals):
         return Matching(proposals, MatchReport(match.resolved_method))

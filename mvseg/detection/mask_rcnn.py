@@ -121,7 +121,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
-            matching = _disagreement_of(self._match(detections, cameras.to(images[0].device)))
+            matching = _disagreement_of(self.match_detections(detections, cameras))
             return self._collect(detections, sizes, masks=matching.masks)
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
@@ -149,7 +149,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _disagreement_of(self.match_detections(detections, cameras))
         config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
         posed = cameras.to("cpu")
-        detected = Pass.of(self, detections, posed, min_score=config.min_score)
+        detected = Pass(self.match_detections, detections, posed, config.min_score)
         leaves = find_leaves(detected, posed, config=config, photos=photos.__getitem__).leaves
         missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
         return _disagreement_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
@@ -173,24 +173,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         min_score: float = 0.0,
         residual_px: int | None = None,
     ) -> Matching:
-        """The second half of `find_regions`: match the output of `detect` for V images, of proposals
-        that score `min_score` or more. `labels` of its regions are rows of the excessive set, view after view.
-        `residual_px`: see `match_proposals`."""
-        matching = self._match(detections, cameras.to("cpu"), min_score=min_score, residual_px=residual_px)
-        return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
-
-    def _match(
-        self,
-        detections: Sequence[dict[str, Tensor]],
-        cameras: Cameras,
-        *,
-        min_score: float = 0.0,
-        residual_px: int | None = None,
-    ) -> Matching:
+        """Second half of `find_regions`: match the output of `detect` for V images, of proposals that score `min_score`
+        or more. `labels` of its regions are rows of the excessive set. `residual_px`: see `match_proposals`."""
+        cameras = cameras.to(detections[0]["boxes"].device)
         with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
             proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
             is_asked = (proposals.regions.areas > 0) & (proposals.detection_scores >= min_score)
-            return match_proposals(
+            matching = match_proposals(
                 proposals.select(is_asked),
                 cameras,
                 boxes=boxes[is_asked],
@@ -200,6 +189,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
                 match=self.match,
                 residual_px=residual_px,
             )
+        return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""

@@ -14,8 +14,6 @@ from mvseg.masks import SURE
 def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float = 0.3) -> Tensor:
     """Non-maximum suppression in which boxes of different groups never suppress each other.
 
-    The arguments are those of `torchvision.ops.batched_nms`.
-
     Args:
         boxes: (R, 4) xyxy.
         scores: (R,).
@@ -56,7 +54,6 @@ def backed_by_views(
         groups: (S, G) integers; only boxes of one group are compared (view and class).
         instance_ids: (S,) int64, -1 = matched to nothing.
         match_scores: (S,) probabilities that the ids are right.
-        iou_threshold: an IoU above this is an overlap.
 
     Returns:
         (S,) bool. A discarded box does not count as a better one for the rest.

@@ -11,7 +11,6 @@ from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.corrections.linked_halves import link_halves
-from mvseg.corrections.unchanged_leaves import leave_joined, unchanged_leaves
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
@@ -45,22 +44,17 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
         with timed("follow"):
             photos = opened.photos if opened.photos.exist else None
             colors = plant.leaf_colors if photos is not None and plant.matching.num_instances else None
-            masks, _ = follow_drawn(masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces)
+            masks = follow_drawn(masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces)
     said = _gather_said(plant, corrected, stays, masks)
     return replace(edited, edits=done.fates, refused=done.refused).choose(said, drawn=plant.drawn)
 
 
 def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[Plant, Tensor]:
-    """Match the edited masks anew, but for those of leaves that stay: these keep their ids. Where the user speaks of
-    such leaves only, nothing is matched, and what matching said stays.
+    """Match the edited masks anew, except those of leaves that stay: these keep their ids. Where the user speaks of
+    such leaves only, nothing is matched. Without leaves that other masks join (`leave_joined`), `previous` is returned,
+    too.
 
-    Args:
-        corrected: D masks and their links.
-        previous: (D,) int64 on the CPU, ids of the leaves that stay as they were seen; -1 for all other masks.
-
-    Returns:
-        What is known with the D masks, and `previous` without the leaves that other masks join, see `leave_joined`.
-    """
+    `previous`: (D,) int64 on the CPU, ids of the leaves that stay; -1 for all other masks."""
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
     is_held = masks.is_corrected | masks.is_linked
     if not rejects and not bool((is_held & (previous < 1)).any()):
@@ -79,6 +73,43 @@ def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[P
     disagreement = plant.opened.find_disagreement(matching)
     matching = matching.with_masks(replace(matched, instance_ids=ids))
     return replace(plant, matching=matching, disagreement=disagreement), previous
+
+
+def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor:
+    """Find the leaves that edits mention but do not change: none of their masks is gone, changed, kept apart from
+    another one, or linked to one of another leaf, and the leaf is not rejected.
+
+    Args:
+        ids: (D,) int64, the leaves of the corrected masks before the edits.
+        before: the masks before the edits, on the CPU, with the ids that the user saw.
+
+    Returns:
+        (L,) int64, their ids in `before`.
+    """
+    must, cannot = ids[corrected.links.must.reshape(-1, 2)], ids[corrected.links.cannot.reshape(-1, 2)]
+    remaining, all_of = (
+        torch.bincount(each.clamp(min=0), minlength=before.num_instances + 1) for each in (ids, before.instance_ids)
+    )
+    changed = (
+        must[must[:, 0] != must[:, 1]].flatten(),
+        cannot[cannot[:, 0] == cannot[:, 1]].flatten(),
+        ids[[each.row for each in corrected.everywhere if each.rejects]],
+        (remaining != all_of).nonzero()[:, 0],
+    )
+    named = ids[corrected.masks.is_corrected | corrected.masks.is_linked]
+    leaves = named[named > 0].unique()
+    return leaves[~torch.isin(leaves, torch.cat(changed))]
+
+
+def leave_joined(previous: Tensor, matched_ids: Tensor, is_held: Tensor) -> Tensor:
+    """`previous` (D,), with -1 for every leaf that other masks join: at least half of its masks are matched
+    (`matched_ids`) to a mask that the user speaks of (`is_held`), and that is of no unchanged leaf."""
+    is_other = is_held & (previous < 1) & (matched_ids > 0)
+    is_joined = torch.isin(matched_ids, matched_ids[is_other])
+    num = int(previous.max().clamp(min=0)) + 1 if len(previous) else 1
+    is_known = previous > 0
+    joined, all_of = (torch.bincount(previous[each & is_known], minlength=num) for each in (is_joined, is_known))
+    return previous.where((2 * joined < all_of)[previous.clamp(min=0)] & (previous > 0), -1)
 
 
 def _gather_said(plant: Plant, corrected: Corrected, previous: Tensor, masks: Masks) -> Edited:

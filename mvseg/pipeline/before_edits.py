@@ -1,7 +1,6 @@
-"""What was known before the user's edits, kept in a result: `mvseg correct` opens with it, and finds nothing anew.
+"""The plant before edits, stored in the result, so that `mvseg correct` need not detect again.
 
-It holds only where all that it follows from is the same: the version of mvseg and of torch, options, photos and cameras
-(see `RecordedRun.changes`). Elsewhere, and where the file is gone, all is computed as before.
+It holds only for the same version of mvseg and of torch, options, photos and cameras (see `RecordedRun.changes`).
 """
 
 from __future__ import annotations
@@ -33,22 +32,12 @@ FIELDS = (
 )  # fmt: skip
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [
-    Approach,
-    Finding,
-    Instances,
-    LeafSurface,
-    RejectedCandidate,
-    MatchReport,
-    Masks,
-    Matching,
-    Quality,
-    Regions,
-]
+    Approach, Finding, Instances, LeafSurface, RejectedCandidate, MatchReport, Masks, Matching, Quality, Regions
+]  # fmt: skip
 
 
 def pack_plant(plant: Plant, findings: Sequence[Finding]) -> bytes | None:
-    """Pack a plant before edits, its surfaces, and the warnings on the way (`findings`). None where it is
-    too much to be read again."""
+    """Pack a plant before edits, its surfaces, and the warnings on the way; None where it is too large to be read."""
     packed = io.BytesIO()
     opened = plant.opened
     torch.save(
@@ -66,11 +55,8 @@ def pack_plant(plant: Plant, findings: Sequence[Finding]) -> bytes | None:
 
 
 def unpack_plant(content: bytes, opened: Opened) -> tuple[Plant, list[Finding]] | None:
-    """Unpack the content of `pack_plant`, on the CPU, for the scene as it was opened, with its caches, and the
-    warnings.
-
-    None: it is of other views, or something else.
-    """
+    """Unpack the content of `pack_plant`, on the CPU, for the opened scene, and the warnings. None: other views, or
+    broken."""
     try:
         inflated = zlib.decompressobj().decompress(content, MOST_BYTES + 1)
         if len(inflated) > MOST_BYTES:

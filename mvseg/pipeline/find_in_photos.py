@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,53 +23,44 @@ from mvseg.matching.result import Matching
 from mvseg.pipeline.open_scene import Opened
 from mvseg.pipeline.plant import Plant, hold_matched, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.results.result import Instances
-from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
+from mvseg.verification.leaf_color import colored_shares
 from mvseg.verification.numbers import CHOICE
-from mvseg.verification.unexplained import is_familiar
+from mvseg.verification.picture import colors_of_leaves, is_familiar
 
 Colors = NDArray[np.bool_]  # of leaves, see `leaf_colors`
 
 
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Plant:
-    """Look for leaves in the photos; the views choose leaves and masks.
+    """Look for leaves in the photos; the views choose leaves and masks. Raises InputError: see `detect_scene`.
 
     The detector looks at several sizes, see `choose_size`, unless one is given, or the views clearly agree about the
-    leaves of a species that the detector knows. With twice as many photos as
-    `DETECTION.judging_views`, or more, so many of them choose the size, or the two between which all photos choose. All
-    sizes are of the parts of the photos that the first pass chose.
-
-    Raises:
-        InputError: see `detect_scene`.
+    leaves of a species that the detector knows. Of twice as many photos as `DETECTION.judging_views`, or more, so many
+    choose the size, or the two between which all photos choose. All sizes are of the parts that the first pass chose.
     """
     detect = opened.config.detect
     if detect.image_size is not None or opened.holds:
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
     few, views = select_judges(opened)
     first = run_pass(few, detect, cache=cache)
-    colors = colors_to_judge_by(few, first)
-    is_cropped = first.passes[0].boxes is not None
-    boxes = first.passes[0].boxes if is_cropped else whole_photos(few.scene)
-
-    def see(size: int) -> PassResult:
-        return judge_pass(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
-
+    colors, parts = colors_to_judge_by(few, first), first.detected.boxes
     first = judge_pass(few, first, colors)
+    boxes = whole_photos(few.scene) if parts is None else parts
     is_clear = first.leaves.agreement >= DETECTION.clear_agreement
-    is_known = is_clear and is_familiar(first.leaves.masks, sure_score=DETECTION.sure_score)
-    best = [first] if is_known else choose_size(see, first)
+    best = [first]
+    if not (is_clear and is_familiar(first.leaves.masks, sure_score=DETECTION.sure_score)):
+        best = choose_size(partial(run_at, few, detect, colors=colors, cache=cache, boxes=boxes), first)
     if few is opened:
         return plant_of_pass(opened, best[0])
     boxes = whole_photos(opened.scene)
-    if is_cropped:
-        masks, cameras = first.passes[0].sure.masks, opened.scene.cameras
+    if parts is not None:
+        masks, cameras = first.detected.sure.masks, opened.scene.cameras
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
     if best[0] is first:  # a species that the detector knows: no other size is worth a pass over all photos
         return plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=boxes))
-    sizes = [None if each is first else each.passes[0].longest for each in best]
-    results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return plant_of_pass(opened, order_sizes([judge_pass(opened, each, colors) for each in results])[0])
+    sizes = [None if each is first else each.detected.longest for each in best]
+    results = [run_at(opened, detect, size, colors=colors, cache=cache, boxes=boxes) for size in sizes]
+    return plant_of_pass(opened, order_sizes(results)[0])
 
 
 def colors_to_judge_by(opened: Opened, first: PassResult) -> Colors | None:
@@ -99,20 +91,27 @@ def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | No
     """Run taught weights at the size that they have learned at, and at the sizes next to it, see `choose_near`; only at
     `DetectConfig.image_size`, where it is given."""
     opened, boxes = plant.opened, plant.boxes
-    colors = plant.leaf_colors if opened.photos.exist else None
-    few, views = select_judges(opened)
     if detect.image_size is not None:
         return run_pass(opened, detect, cache=cache, boxes=boxes)
-
-    def see(size: int) -> PassResult:
-        return judge_pass(few, run_pass(few, replace(detect, image_size=size), cache=cache, boxes=boxes[views]), colors)
-
-    results = choose_near(see, plant.image_size, most=plant.longest_side)
+    run = partial(run_at, colors=plant.leaf_colors if opened.photos.exist else None, cache=cache)
+    few, views = select_judges(opened)
+    results = choose_near(partial(run, few, detect, boxes=boxes[views]), plant.image_size, most=plant.longest_side)
     if few is opened:
         return results[0]
-    sizes = [each.passes[0].longest for each in results]
-    results = [run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes) for size in sizes]
-    return order_sizes([judge_pass(opened, each, colors) for each in results])[0]
+    return order_sizes([run(opened, detect, each.detected.longest, boxes=boxes) for each in results])[0]
+
+
+def run_at(
+    opened: Opened,
+    detect: DetectConfig,
+    size: int | None,
+    *,
+    colors: Colors | None,
+    cache: CachedDetections | None,
+    boxes: Tensor,
+) -> PassResult:
+    """Run the detector at a size, see `run_pass`, to compare the pass with others, see `judge_pass`."""
+    return judge_pass(opened, run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
 
 
 def run_pass(
@@ -122,11 +121,7 @@ def run_pass(
     cache: CachedDetections | None,
     boxes: Tensor | None = None,
 ) -> PassResult:
-    """Run the detector once over all views; the result holds its warnings, as it may be thrown away.
-
-    Args:
-        detect: which detector, and at which size.
-    """
+    """Run the detector once over all views; the result holds its warnings, as it may be thrown away."""
     with collect_warnings() as findings:
         detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
         photos = opened.photos if opened.photos.exist else None
@@ -138,22 +133,20 @@ def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
     """Make a plant of the pass that was selected; warn of its findings."""
     for finding in result.findings:
         warn(finding)
-    detected = result.passes[0]
+    detected = result.detected
     if not len(detected.sure):
         warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
-    matching = Matching(result.matched[0], result.report)
+    matching = Matching(result.matched[0], detected.sure.report)
     boxes = whole_photos(opened.scene) if detected.boxes is None else detected.boxes
     if opened.holds:
         return hold_matched(opened, matching, image_size=detected.longest, boxes=boxes)
     plant = Plant(
         opened=opened,
         matching=matching,
-        instances=Instances(),
         proposals=result.proposals,
         matched=result.matched,
         image_size=detected.longest,
         boxes=boxes,
-        rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
     return plant.with_leaves(result.leaves)

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
-from mvseg.corrections.settle import settle_edits
+from mvseg.corrections.corrected import APPLIED, Fate, RejectedPixel
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding, Values, keep_causes
 from mvseg.masks import STEM_CLASS
 from mvseg.pipeline.plant import Plant
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.result import Result
+from mvseg.scene import Cameras
 from mvseg.system.running import timed
-
-if TYPE_CHECKING:
-    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.verification.choose import RejectedCandidate
+from mvseg.verification.evidence import paint_view
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
@@ -32,7 +32,7 @@ def check_result(result: Result, plant: Plant) -> Result:
     opened = plant.opened
     with timed("check"):
         check = check_scene(result.scene, result.regions, photos=opened.photos, is_detected=opened.given is None)
-    doubtful = _find_doubtful(result, has_stems=plant.opened.config.stem_category is not None)
+    doubtful = _find_doubtful(result.surfaces or {}, _stems_of(result, opened.config))
     noticed = *check.findings, plant.disagreement, _find_missing(plant, result), doubtful
     findings = keep_causes(each for each in noticed if each is not None and each.code not in REFUSED)
     for finding in findings:
@@ -42,13 +42,8 @@ def check_result(result: Result, plant: Plant) -> Result:
 
 
 def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | None = None) -> Result:
-    """The final masks and ids, and their surfaces: what the page shows that the user corrects.
-
-    Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted by a later one.
-
-    Args:
-        same_segmenter: the surfaces before edits, see `fit_surfaces`; None: there are no edits.
-    """
+    """The final masks and ids, and their surfaces, as the page shows them. `same_segmenter`: the surfaces before edits,
+    see `fit_surfaces`. Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted."""
     opened = plant.opened
     plant = plant if opened.holds else complete_masks(plant)
     shapes = opened.config.reconstruct
@@ -69,6 +64,28 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         fates=fates,
         learned=plant.learned,
     )
+
+
+def settle_edits(
+    edits: Sequence[Fate],
+    refused: Sequence[RejectedPixel],
+    rejected: Sequence[RejectedCandidate],
+    surfaces: Mapping[int, LeafSurface],
+    *,
+    cameras: Cameras,
+) -> tuple[tuple[RejectedCandidate, ...], tuple[Fate, ...]]:
+    """Apply "no leaf here" edits that point at no mask but answer a question, at a rejected candidate, which goes if
+    the edit is about all photos, or at a surface without a mask. Returns the other candidates and the fates."""
+    gone, answers = set[int](), set[int]()
+    for each in refused:
+        candidates = {n for n, other in enumerate(rejected) if other.masks.regions.at(each.view, each.column, each.row)}
+        gone |= candidates if each.everywhere else set()
+        width, height = cameras.sizes[each.view].tolist()
+        is_in_photo = 0 <= each.column < width and 0 <= each.row < height
+        if candidates or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
+            answers.add(each.edit)
+    fates = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in edits)
+    return tuple(other for n, other in enumerate(rejected) if n not in gone), fates
 
 
 def complete_masks(plant: Plant) -> Plant:
@@ -98,16 +115,20 @@ def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -
 
 
 def _find_missing(plant: Plant, result: Result) -> Finding | None:
-    from mvseg.verification.unexplained import find_missing
+    from mvseg.verification.picture import find_missing
 
     if plant.opened.holds or (plant.edits and not len(result.masks)):  # the user says that there is none
         return None
     return find_missing(result.masks, plant.opened.photos, sure_score=DETECTION.sure_score)
 
 
-def _find_doubtful(result: Result, *, has_stems: bool) -> Finding | None:
-    of_stems = result.masks.instance_ids[result.masks.classes == STEM_CLASS].tolist() if has_stems else ()
-    surfaces = {leaf: each for leaf, each in (result.surfaces or {}).items() if leaf not in of_stems}
+def _stems_of(result: Result, config: RunConfig) -> list[int]:
+    stems = result.masks.instance_ids[result.masks.classes == STEM_CLASS].unique().tolist()
+    return [each for each in stems if each > 0] if config.stem_category is not None else []
+
+
+def _find_doubtful(surfaces: Mapping[int, LeafSurface], stems: Sequence[int]) -> Finding | None:
+    surfaces = {leaf: each for leaf, each in surfaces.items() if leaf not in stems}
     leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good)
     if not leaves:
         return None
@@ -125,8 +146,6 @@ def measure(result: Result, config: RunConfig) -> Result:
     regions, ids, cameras = result.masks.regions, result.masks.instance_ids, result.scene.cameras
     with timed("voxels"):
         voxels = reconstruct_voxels(regions, ids, cameras, config=config.reconstruct, surfaces=result.surfaces)
-    has_stems = config.stem_category is not None
-    stems = ids[result.masks.classes == STEM_CLASS].unique().tolist() if has_stems else ()
     with timed("measure"):
         traits = measure_plant(
             result.scene,
@@ -135,7 +154,7 @@ def measure(result: Result, config: RunConfig) -> Result:
             voxels=voxels,
             photos=result.photos,
             config=config.traits,
-            stems=[instance for instance in stems if instance > 0],
+            stems=_stems_of(result, config),
             probabilities=result.instances.probabilities,
         )
     return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits))

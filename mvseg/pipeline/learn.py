@@ -36,7 +36,7 @@ from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import ViewLabels, label_views
 from mvseg.verification.leaf_scores import order_ratings
 from mvseg.verification.numbers import CHOICE
-from mvseg.verification.unexplained import is_familiar
+from mvseg.verification.picture import is_familiar
 
 ROUNDS = 2  # limit: where nobody says how many; most plants gain nothing from a third one (docs/detector.md)
 # chosen: new weights stay if their rating is at least so many times that of the weights before. Of rounds that grew by
@@ -50,20 +50,15 @@ def learn(
 ) -> Plant:
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
-    A round: labels from what the views chose, and from what the user corrected; the weights that the run began with
-    learn these (`fine_tune`); the detector looks again, at the same size and at those next to it (`run_near`); the
-    views choose. The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end
-    when it grows by less than `GROWTH`. Ctrl-C ends them, too, and what was there stays.
+    A round: labels from the leaves that the views chose, and from the user's edits; the first weights learn these
+    (`fine_tune`); the detector looks again, at the same size and at those next to it (`run_near`); the views choose.
+    The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end when it grows
+    by less than `GROWTH`, or with Ctrl-C. Warns (InputWarning) where the views agree about too few leaves.
 
     Args:
-        plant: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
-        corrections: of the user, whose masks are certain.
         rounds: number of rounds that the user asks for on the page. All are learned, and the last weights stay without
             comparison, for the user to judge. None: as many as `RunConfig.learn` says, and `Plant.rating` decides.
-
-    Returns:
-        The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
     best, areas = plant, [plant.rating.agreed_area]
     try:

@@ -38,15 +38,12 @@ class Opened:
     """A scene, opened for a run.
 
     Attributes:
-        scene: with the views that are taken.
-        photos: of these.
+        scene: with the views that are taken; `photos` of these.
         given: their masks, matched to nothing; None: a detector is to find them.
-        mask_kind: what those were read from ("COCO", "label images", ...); "" without any.
+        mask_kind: source of those ("COCO", "label images", ...); "" without any.
         views_left_out: names of the other views.
-        config: the options of all stages.
         inputs: {file or folder: SHA-256 as it was read} of cameras and masks, or of the detector's weights.
-        surfaces: cache of surfaces that were fitted to masks of the scene.
-        snapped: {digest of a mask and the photo around it: the mask with edges of colour}, see `snap_masks`.
+        snapped: see `snap_masks`.
     """
 
     scene: Scene
@@ -119,20 +116,18 @@ def open_scene(
             inputs |= _hash_weights(config)
             return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config, inputs=inputs)
         mask_files = recognise_masks(whole, masks)
-        regions = read_masks(whole, mask_files, crowd=config.coco_crowd, categories=config.category_names)
-        stems = None
-        if config.stem_category is not None:
-            stems = read_masks(whole, mask_files, crowd=config.coco_crowd, categories=[config.stem_category])
+        names = [config.category_names, *([[config.stem_category]] if config.stem_category is not None else [])]
+        regions = [read_masks(whole, mask_files, crowd=config.coco_crowd, categories=each) for each in names]
         if before != {masks: _hash_masks(masks)}:
             raise InputError(f"{masks}: has changed while it was read, expected masks that are complete")
-        num_given, regions = len(regions), regions.of_views(taken) if left_out else regions
+        parts = [each.of_views(taken) if left_out else each for each in regions]
         if config.views is not None and left_out:
-            counts: Values = {"count": num_given - len(regions), "total": num_given, "taken": len(taken)}
+            num_given = len(regions[0])
+            counts: Values = {"count": num_given - len(parts[0]), "total": num_given, "taken": len(taken)}
             views: Values = {"num_views": len(whole.views), "views": config.views or 0}
             warn(Finding("masks_of_other_views", str(masks), {**counts, **views}))
-        given = Masks.of(regions)
-        if stems is not None:
-            stems = stems.of_views(taken) if left_out else stems
+        given = Masks.of(parts[0])
+        for stems in parts[1:]:
             both = Masks.concatenate((given, Masks.of(stems, classes=torch.full((len(stems),), STEM_CLASS))))
             given = both.select(both.view_index.argsort(stable=True))
         return Opened(

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,13 +21,11 @@ from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
 from mvseg.verification.candidates import Key
-from mvseg.verification.choose import Edited, add_beside, choose_leaves, find_again
+from mvseg.verification.choose import Edited, Leaves, RejectedCandidate, add_beside, choose_leaves, find_again
 from mvseg.verification.evidence import Drawn, draw_views
-from mvseg.verification.leaf_color import colored_shares, colors_of_leaves
+from mvseg.verification.leaf_color import colored_shares
 from mvseg.verification.leaf_scores import Rating, rate_pass
-
-if TYPE_CHECKING:
-    from mvseg.verification.choose import Leaves, RejectedCandidate
+from mvseg.verification.picture import colors_of_leaves
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,30 +35,26 @@ class Plant:
     Whoever made the masks, a plant is the same: given masks are proposals of which all are sure.
 
     Attributes:
-        opened: the scene as it was opened.
         matching: D masks with their ids, and a report on the scene.
-        instances: initial surfaces (`starts`) and probabilities of the leaves that the views chose.
         proposals: R masks on the CPU, the excessive set of the detector, or the given masks.
         matched: tables of matched proposals, the sure ones first.
         image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
-        rejected: candidates that the views did not choose.
+        instances: initial surfaces (`starts`) and probabilities of the leaves.
         agreement: of the views about the leaves, see `Leaves`; NaN where they do not choose.
         keys: {instance id: key of the candidate that it was}.
-        edits: the user's edits with their fates; () without any.
         refused: pixels without a mask where the user says that no leaf is.
-        learned: weights that the detector learned from this plant.
         disagreement: finding on views that disagree about the masks, see `find_disagreement`; None: they agree.
     """
 
     opened: Opened
     matching: Matching
-    instances: Instances
     proposals: Masks
     matched: tuple[Masks, ...]
     image_size: int
     boxes: Tensor
-    rejected: tuple[RejectedCandidate, ...]
+    instances: Instances = field(default_factory=Instances)
+    rejected: tuple[RejectedCandidate, ...] = ()
     agreement: float = float("nan")
     keys: Mapping[int, Key] = field(default_factory=dict)
     edits: tuple[Fate, ...] = ()
@@ -124,10 +117,8 @@ class Plant:
         return colors_of_leaves(self.masks.to("cpu"), self.opened.photos)
 
     def with_masks(self, masks: Masks) -> Plant:
-        """The same with other masks. Gaps between their ids close; what is known of the instances follows."""
-        return replace(
-            self, matching=self.matching.with_masks(masks.close_gaps()), instances=self.instances.close_gaps(masks)
-        )
+        """The same with other masks of the same leaves."""
+        return replace(self, matching=self.matching.with_masks(masks))
 
     def with_leaves(self, leaves: Leaves) -> Plant:
         """The same with the leaves that were chosen."""
@@ -163,12 +154,10 @@ def hold_matched(
     plant = Plant(
         opened=opened,
         matching=matching,
-        instances=Instances(),
         proposals=masks,
         matched=(masks,) if again is None else (masks, again),
         image_size=int(boxes.max()) if image_size is None else image_size,
         boxes=boxes,
-        rejected=(),
         disagreement=opened.find_disagreement(matching),
     )
     return plant.choose()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -42,17 +42,14 @@ class Instances:
     voxels: Mapping[int, VoxelGrid] | None = None
     traits: Traits | None = None
 
-    def close_gaps(self, masks: Masks) -> Instances:
-        """The shapes of the instances that have masks, by the ids that `masks.close_gaps()` gives them."""
-        return self._by(masks.renumber)
-
     def renumber(self, numbers: Mapping[int, int]) -> Instances:
         """Instance k by the id `numbers[k]`."""
-        return self._by(lambda values: {numbers[instance]: each for instance, each in values.items()})
 
-    def _by(self, renumber: Callable[[Mapping[int, Any]], Any]) -> Instances:
-        surfaces, voxels = (None if each is None else renumber(each) for each in (self.surfaces, self.voxels))
-        return Instances(renumber(self.probabilities), renumber(self.starts), surfaces, voxels)
+        def rename(values: Mapping[int, Any] | None) -> Any:
+            return None if values is None else {numbers[instance]: each for instance, each in values.items()}
+
+        columns = (rename(each) for each in (self.probabilities, self.starts, self.surfaces, self.voxels))
+        return Instances(*columns)
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,9 @@ from mvseg.crop import Box
 from mvseg.evaluation.labelled_photo import LabelledPhoto, mask_photo
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
-from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
+from mvseg.verification.leaf_color import has_leaf_color
 from mvseg.verification.numbers import CHOICE
+from mvseg.verification.picture import colors_of_leaves
 
 LIKELY = 0.5  # definition: P of a leaf that is learned: it is likelier a leaf than not
 

@@ -50,14 +50,13 @@ class Candidates:
         return {key: index for index, key in enumerate(self.keys)}
 
     def match_scores(self, rows: Ints, of: Ints) -> Floats:
-        """(N,) match score of N masks, by their rows, for a candidate each; NaN where the matcher gave none, and for
-        candidate -1."""
+        """(N,) match score of N masks, by their rows, for a candidate each; NaN where the matcher gave none."""
         scores: Floats = np.append(self.matched, np.full((len(self.matched), 1), np.nan), 1)[rows, of]
         return scores
 
     @cached_property
     def has_surface(self) -> Bools:
-        """(K,)"""
+        """(K,) bool."""
         return np.array([each is not None for each in self.surfaces], bool)
 
     @cached_property
@@ -85,17 +84,13 @@ class Candidates:
 
 def gather_candidates(
     matched: Sequence[Masks],
-    rows: Sequence[Tensor],
-    *,
     table: Masks,
     fit: Fit | None,
 ) -> Candidates:
-    """The instances of each matching; those that an earlier one has, too, once.
+    """The instances of each matching, once each.
 
     Args:
-        matched: masks of each matching.
-        rows: (D,) int64 of each, their rows in the table.
-        table: R' masks.
+        matched: masks of each matching; their `proposal` is their row in the `table`.
         fit: {instance id: surface} to instances of masks; None: no surfaces.
     """
     areas = table.regions.areas.double()
@@ -103,14 +98,13 @@ def gather_candidates(
     members: list[Tensor] = []  # rows of the table, of each candidate
     columns, source = [], []
     for number, masks in enumerate(matched):
-        ids = masks.instance_ids
-        instances = ids[ids > 0].unique().tolist()
-        new = [each for each in instances if not _is_there(rows[number][ids == each], members, areas)]
+        ids, rows = masks.instance_ids, masks.proposal
+        new = [each for each in ids[ids > 0].unique().tolist() if not _is_there(rows[ids == each], members, areas)]
         is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
         fitted = {} if fit is None else fit(replace(masks, instance_ids=ids.where(is_new, -1)))
         for each in new:
             own = ids == each
-            members.append(rows[number][own])
+            members.append(rows[own])
             surface = fitted.get(each)
             shapes.append(surface if surface is not None and surface.exists else None)
             columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))

@@ -33,7 +33,7 @@ class Step:
     Attributes:
         candidate: its index.
         chance: P, when the leaves before it had taken their masks.
-        coverage: share of its expected area that its masks show, see `Met`.
+        coverage: see `Met`.
         terms: (T,) that P follows from, as in `LEAF_TERMS`.
         rows: of the masks that it may take.
     """
@@ -53,7 +53,7 @@ class Choice:
         candidates: (L,) int64, their indices.
         chances: (L,) P.
         leaf: (D,) int64, the leaf that each mask shows, from 0 on; -1 for none.
-        q: (D,) how likely it does; 0 for none.
+        q: (D,) its probability; 0 for none.
         steps: of all candidates, the likeliest first.
     """
 
@@ -222,12 +222,8 @@ def rank(
 
 
 def least_chance(chances: Floats) -> float:
-    """From which chance on to take things, for the largest expected F1: with n
-    taken, 2 sum(chances taken) / (n + sum(all chances)). Nothing is tuned here, and it is never above one half.
-
-    Args:
-        chances: (N,) in [0, 1].
-    """
+    """Lowest chance (N,) to accept, for the largest expected F1: with n accepted, 2 sum(accepted) / (n + sum(all)).
+    Nothing is tuned here, and it is never above one half."""
     order = np.sort(chances)[::-1]
     if not len(order) or order[0] <= 0:
         return 1.0
@@ -236,11 +232,9 @@ def least_chance(chances: Floats) -> float:
 
 
 def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
-    """(D,) the leaf that each mask shows, -1 = none, and its chance.
-
-    In every view the assignment of masks to the L leaves of `q` (D, L) with the largest sum of chances, each used once.
-    Of two masks in it that show the same, the likelier one stays, and the other leaf takes its next best.
-    """
+    """(D,) the leaf that each mask shows, -1 = none, and its chance: in every view the assignment of masks to the L
+    leaves of `q` (D, L) with the largest sum of chances, each used once. Of two masks in it that show the same, the
+    likelier one stays, and the other leaf takes its next best."""
     leaf, q_of = np.full(len(q), -1), np.zeros(len(q))
     for each in drawn if q.shape[1] else ():
         free = np.where(q[each.rows] >= CHOICE.least_q, q[each.rows], 0.0)

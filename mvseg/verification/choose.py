@@ -1,13 +1,12 @@
 """The views choose: of all proposals, which masks show which leaf.
 
-A detector's score says how much a mask looks like the leaves that it has learned, not whether it is one. So the
-excessive set is kept, weak proposals included, and the views decide. Candidates are the instances that the matcher
-finds among the sure proposals, and again among many more, each with its surface. The likeliest leaf comes first and
-takes its masks; the others are judged by what is left (`leaf_scores.py`). So duplicates, pieces and masks over two
-leaves fall by themselves. The paper's idea of an excessive set from which the views choose, with surfaces for maps.
+A detector's score says how much a mask looks like the leaves that it has learned, not whether it is one. Candidates are
+the instances that the matcher finds among the sure proposals, and again among many more, each with its surface. The
+likeliest leaf comes first and takes its masks; the others are judged by the remaining masks (`leaf_scores.py`). So
+duplicates, pieces and masks over two leaves fall by themselves. The paper's excessive set, with surfaces for maps.
 
-Given masks are proposals, too, which the matcher has found one leaf for: they are held to it (`Rows.held`), and another
-leaf takes them only with a q of `SURE` or more. So no mask loses its id without getting another.
+Given masks are proposals, too: they are held to the leaf that the matcher found (`Rows.held`), and another leaf takes
+them only with a q of `SURE` or more. So no mask loses its id without getting another.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ import torch
 from torch import Tensor
 
 from mvseg.arrays import Bools, Ints
-from mvseg.errors import warn
+from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
@@ -31,11 +30,10 @@ from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import Choice, Rows, choose
-from mvseg.verification.evidence import Drawn, draw_views, see
+from mvseg.verification.evidence import Drawn, draw_views, median_parallax, see
 from mvseg.verification.leaf_scores import Pairs, show_chances
 from mvseg.verification.match_again import match_again
-from mvseg.verification.numbers import AGAIN, CHOICE, EVIDENCE, ROUGH
-from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
+from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +49,15 @@ class Leaves:
     """Accepted leaves.
 
     Attributes:
-        masks: D' masks on the CPU with ids from 1 on. Of proposals of a detector, those of leaves, by view and
-            instance, the likeliest leaf first; match scores are q. At most one mask per leaf and view, except the
-            user's; masks of the user without a leaf have id -1. Given masks are all there, in their order; those that
-            moved have q as their match score.
-        surfaces: {instance id: surface} of those with a credible one.
+        masks: D' masks on the CPU with ids from 1 on, by view and leaf, the likeliest leaf first; match scores are q.
+            At most one mask per leaf and view, except the user's, which may have id -1. Given masks are all there, in
+            their order; only those that moved have q as their match score.
+        surfaces: {instance id: surface}, the credible ones.
         probabilities: {instance id: P}.
-        rejected: the candidates that were not chosen, the most likely first.
+        rejected: the most likely first.
         keys: {instance id: key of its candidate}.
-        agreement: share of a leaf's expected area that its masks show; mean over the leaves that have a surface, NaN
-            without any. Pieces of leaves, whose ids mix, have little.
+        agreement: share of a leaf's expected area that its masks show; mean over leaves with a surface, NaN without
+            any. Pieces of leaves, whose ids mix, have little.
     """
 
     masks: Masks
@@ -75,7 +72,7 @@ class Leaves:
         """Leaves as they were matched, without probabilities."""
         ids = matched.instance_ids
         keys = {each: tuple(sorted(matched.proposal[ids == each].tolist())) for each in ids[ids > 0].unique().tolist()}
-        return Leaves(matched, {}, {}, (), keys)
+        return Leaves(matched, surfaces={}, probabilities={}, rejected=(), keys=keys)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,17 +139,18 @@ class Judges:
         return fit_roughly(masks, self.cameras, self.cache)
 
 
-def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | None:
-    """Match given masks that do not show their own leaf once more, see `match_again`.
+def fit_roughly(masks: Masks, cameras: Cameras, cache: SurfaceCache | None) -> dict[int, LeafSurface]:
+    """{instance id: surface}, fitted to few views. Nothing is warned of: the final fits warn."""
+    with collect_warnings():
+        ids = masks.instance_ids
+        return fit_surfaces(masks.regions, ids, cameras, most_views=EVIDENCE.rough_views, is_rough=True, cache=cache)
 
-    Args:
-        matched: D masks on the CPU, which are all the proposals.
-        config: that they were matched with.
-    """
+
+def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | None:
+    """Match given masks (all proposals), matched with `config`, once more where they do not show their own leaf."""
     if not judges.has_surfaces or not matched.num_instances:
         return None
-    rows, cameras = [matched.proposal], judges.cameras
-    candidates = gather_candidates([matched], rows, table=matched, fit=judges.fit)
+    cameras, candidates = judges.cameras, gather_candidates([matched], matched, judges.fit)
     drawn, own = draw_views(matched.regions, candidates.surfaces, cameras), candidates.of_rows(0)
     evidence, scores = see(drawn, len(matched), candidates.is_credible), np.full(len(matched), CHOICE.given)
     q = show_chances(Pairs(candidates, evidence, scores))
@@ -170,38 +168,34 @@ def choose_leaves(
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
-    Masks that the user corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
-    that no detector found. Overlapping proposals are dropped; deleted masks are not proposed again. All other
-    candidates are those without edits: an edit about one leaf changes no other, unless they compete for masks. A leaf
-    that satisfies all edits about it already keeps its candidate from before the edits.
+    Masks that the user corrected or linked are certain: they stay, and their instances are leaves. Overlapping
+    proposals are dropped; deleted masks are not proposed again. All other candidates are those without edits: an edit
+    about one leaf changes no other, unless they compete for masks. A leaf that satisfies all edits about it keeps its
+    candidate.
+
+    Warns (InputWarning) where the cameras see the plant from one side only (`EVIDENCE.least_parallax`): surfaces are
+    too uncertain to judge proposals of a detector, and matching and detection scores do it.
 
     Args:
-        proposals: R masks, the excessive set, or given masks; their ids do not matter.
+        proposals: R masks; their ids do not matter.
         matched: tables of some of the proposals, each matched, the sure ones first.
         drawn: V views of the proposals alone, where they were drawn before.
-
-    Returns:
-        The leaves. Where the cameras see the plant from one side only, by less than `ROUGH.least_parallax`, surfaces
-        are too uncertain to judge what a detector proposes: matching and detection scores do it, and a warning
-        (InputWarning) says so.
     """
     proposals, matched = proposals.to("cpu"), [each.to("cpu") for each in matched]
     if judges.holds and not judges.has_surfaces and edited is None:
         return Leaves.of(matched[0])
     table, row_of = _add_made(proposals, edited)
     is_judged = judges.has_surfaces and (judges.holds or _is_surrounded(matched[0], edited, judges.cameras))
-    tables, rows = list(matched), [each.proposal for each in matched]
     if edited is not None:  # first, so that what edits say of a leaf is not the same as what was there before
-        tables, rows = [edited.concerned(), *tables], [row_of, *rows]
-    fit = judges.fit if is_judged else None
-    candidates = gather_candidates(tables, rows, table=table, fit=fit)
+        matched = [replace(edited.concerned(), proposal=row_of), *matched]
+    candidates = gather_candidates(matched, table, judges.fit if is_judged else None)
     views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
     if judges.holds:
         terms = _hold(terms, edited, candidates, table, row_of)
     chosen = choose(candidates, table, drawn=views, rows=terms, min_probability=judges.min_probability)
     if judges.holds:
-        return _make_given(chosen, candidates, table.select(row_of), row_of, terms)
+        return _make_given(chosen, candidates, table, row_of.numpy(), terms)
     is_users = np.zeros(len(table), bool)
     if edited is not None:
         is_users[row_of[edited.is_certain]] = True
@@ -223,9 +217,9 @@ def _add_made(proposals: Masks, edited: Edited | None) -> tuple[Masks, Tensor]:
 def _is_surrounded(matched: Masks, edited: Edited | None, cameras: Cameras) -> bool:
     masks = matched if matched.num_instances or edited is None else edited.masks
     parallax = median_parallax(masks, cameras)
-    if parallax < ROUGH.least_parallax:
+    if parallax < EVIDENCE.least_parallax:
         warn(Finding("leaves_seen_from_one_side", values={"degrees": parallax}))
-    return parallax >= ROUGH.least_parallax
+    return parallax >= EVIDENCE.least_parallax
 
 
 def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, drawn: Sequence[Drawn]) -> Rows:
@@ -259,7 +253,7 @@ def _hold(terms: Rows, edited: Edited | None, candidates: Candidates, table: Mas
         rows = row_of.numpy()
         held[rows] = np.where(held[rows] < 0, before, held[rows])
     hold = np.where(table.origin < Origin.OTHER_VIEWS, SURE, 0.0)
-    if table.regions.num_views < AGAIN.least_views:  # two masks always agree on some surface
+    if table.regions.num_views < EVIDENCE.least_views:  # two masks always agree on some surface
         hold = np.where(candidates.match_scores(np.arange(len(table)), held) >= SURE, 1.0, hold)
     is_gone = np.isneginf(terms.shows).all(1)
     return replace(terms, held=np.where(is_gone, -1, held), hold=hold)
@@ -275,39 +269,36 @@ def _without(proposals: Masks, others: Masks) -> Bools:
     return stays
 
 
-def _make_given(chosen: Choice, candidates: Candidates, masks: Masks, row_of: Tensor, terms: Rows) -> Leaves:
-    """Leaves of given masks, numbered in the order of their candidates."""
-    rows, order = row_of.numpy(), np.argsort(chosen.candidates)
-    number = np.append(np.empty_like(order), -2)
-    number[order] = np.arange(len(order))
-    ids = number[chosen.leaf[rows]] + 1
-    to = np.append(chosen.candidates, -1)[chosen.leaf[rows]]
-    matched = candidates.match_scores(rows, to)
-    scores = np.where(np.isnan(matched) | terms.certain[rows].any(1), chosen.q[rows], matched)
-    given = replace(
-        masks,
-        instance_ids=torch.from_numpy(np.where(ids > 0, ids, -1)),
-        match_scores=torch.from_numpy(scores).float(),
+def _number_leaves(chosen: Choice, candidates: Candidates, table: Masks, *, rows: Ints, order: Ints) -> Leaves:
+    """Leaves with their masks, some rows of the table, and keys alone: numbered in an order (L,) of the chosen ones."""
+    number = np.append(np.argsort(order), -2)
+    masks = replace(
+        table.select(torch.from_numpy(rows)),
+        instance_ids=torch.from_numpy(number[chosen.leaf[rows]] + 1),
+        match_scores=torch.from_numpy(chosen.q[rows]).float(),
     )
-    keys = {place + 1: candidates.keys[index] for place, index in enumerate(chosen.candidates[order].tolist())}
-    return replace(Leaves.of(given), keys=keys)
+    keys = {place: candidates.keys[index] for place, index in enumerate(chosen.candidates[order].tolist(), 1)}
+    return Leaves(masks, surfaces={}, probabilities={}, rejected=(), keys=keys)
+
+
+def _make_given(chosen: Choice, candidates: Candidates, table: Masks, rows: Ints, terms: Rows) -> Leaves:
+    """Leaves of given masks, numbered in the order of their candidates; those that did not move keep their scores."""
+    leaves = _number_leaves(chosen, candidates, table, rows=rows, order=np.argsort(chosen.candidates))
+    scores = candidates.match_scores(rows, np.append(chosen.candidates, -1)[chosen.leaf[rows]])
+    moves = torch.from_numpy(np.isnan(scores) | terms.certain[rows].any(1))
+    match_scores = leaves.masks.match_scores.where(moves, torch.from_numpy(scores).float())
+    return replace(leaves, masks=replace(leaves.masks, match_scores=match_scores))
 
 
 def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, is_users: Bools) -> Leaves:
     rows: Ints = np.flatnonzero((chosen.leaf >= 0) | is_users)
     rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
-    ids = np.where(chosen.leaf[rows] >= 0, chosen.leaf[rows] + 1, -1)
-    masks = replace(
-        table.select(torch.from_numpy(rows)),
-        instance_ids=torch.from_numpy(ids),
-        match_scores=torch.from_numpy(chosen.q[rows]).float(),
-    )
     surfaces = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
     taken = set(chosen.candidates.tolist())
     accepted = [each for each in chosen.steps if each.candidate in taken]
     shares = [each.coverage for each in accepted if candidates.has_surface[each.candidate]]
-    return Leaves(
-        masks=masks,
+    return replace(
+        _number_leaves(chosen, candidates, table, rows=rows, order=np.arange(len(chosen.candidates))),
         surfaces={number: each for number, each in enumerate(surfaces, 1) if each is not None and each.is_credible},
         probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
         rejected=tuple(
@@ -315,7 +306,6 @@ def _make_leaves(chosen: Choice, candidates: Candidates, table: Masks, is_users:
             for each in chosen.steps
             if each.candidate not in taken and len(each.rows)
         ),
-        keys={number: candidates.keys[each] for number, each in enumerate(chosen.candidates.tolist(), 1)},
         agreement=float(np.round(np.mean(shares), CHOICE.digits)) if shares else float("nan"),
     )
 

@@ -1,9 +1,8 @@
-"""Masks, in all other views, of the leaves that the user drew in two or more.
+"""Masks, in all other views, of the leaves that the user drew in two or more. Not in the paper.
 
-Two outlines leave a surface's tilt open. The other views close it: what has the colour of leaves there, and is in no
-mask of another leaf, is the leaf itself wherever the points that both outlines allow come to lie in it. The surface
-is fitted to those parts as well, and then says what each view shows of the leaf. Half masks of the leaf, which the user
-did not draw, go: they would make it half a surface. Not in the paper.
+Two outlines leave a surface's tilt open. Leaf-coloured free pixels of the other views close it: they belong to the leaf
+where they contain projections of the hull of both outlines. The surface is fitted to those parts as well. Half masks of
+the leaf, which the user did not draw, go: they would make it half a surface.
 """
 
 from __future__ import annotations
@@ -29,9 +28,10 @@ from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
-from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
-from mvseg.verification.numbers import DRAWN, EVIDENCE, ROUGH
-from mvseg.verification.rough_surfaces import median_parallax
+from mvseg.verification.evidence import median_parallax
+from mvseg.verification.leaf_color import has_leaf_color
+from mvseg.verification.numbers import DRAWN, EVIDENCE
+from mvseg.verification.picture import colors_of_leaves
 
 Frame = NDArray[np.bool_]
 
@@ -46,33 +46,30 @@ def follow_drawn(
     photos: ReadPhoto | None,
     colors: Frame | None = None,
     cache: SurfaceCache | None = None,
-) -> tuple[Masks, dict[int, LeafSurface]]:
+) -> Masks:
     """Give the leaves that the user drew a mask in each other view that shows them openly.
 
-    That is where at least `DRAWN.least_visible` of the leaf's surface, and `EVIDENCE.open_pixels`, lie in no mask of
-    another leaf, and `DRAWN.least_colored` of it have the colour of leaves. There, a mask that was matched to nothing
-    and agrees with it (`EVIDENCE.fits`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`. With
-    photos, it takes the place of half masks of the leaf, see `_drop_halves`.
+    There, at least `DRAWN.least_visible` of the leaf's surface, and `EVIDENCE.open_pixels`, lie in no mask of another
+    leaf, and `DRAWN.least_colored` of it have the colour of leaves. An unmatched mask that agrees with it
+    (`EVIDENCE.fits`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
 
     Args:
-        masks: D masks, matched; those that the user drew have `Origin.CORRECTED`.
+        masks: D masks, matched; the user drew those with `Origin.CORRECTED`.
         photos: of the views. None: the outlines alone tell.
-        colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
+        colors: see `colors_of_leaves`; None: those of the masks.
 
     Returns:
-        The D masks on the CPU in their order, without half masks, and the new ones after them. And {instance id:
-        surface} of the leaves that were looked for and are credible.
+        The D masks on the CPU in their order, without half masks (see `_drop_halves`), and the new ones after them.
     """
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
     drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
     followed = [leaf for leaf in drawn if _is_followed(masks, leaf)]
-    if not followed or median_parallax(masks, cameras) < ROUGH.least_parallax:
-        return masks, {}
+    if not followed or median_parallax(masks, cameras) < EVIDENCE.least_parallax:
+        return masks
     colored = [np.ones((height, width), bool) for width, height in cameras.sizes.tolist()]
     if photos is not None:
         colors = colors_of_leaves(masks, photos) if colors is None else colors
         colored = [has_leaf_color(photos(view), colors) for view in range(len(cameras))]
-    surfaces: dict[int, LeafSurface] = {}
     for leaf in followed:
         if photos is not None:
             masks = _drop_halves(masks, leaf, colored, cameras=cameras, cache=cache)
@@ -80,9 +77,8 @@ def follow_drawn(
             continue
         surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras, cache=cache)
         if surface.is_credible:
-            surfaces[leaf] = surface
             masks = _show(masks, leaf, surface, cameras=cameras, colored=colored)
-    return masks, surfaces
+    return masks
 
 
 def _is_followed(masks: Masks, leaf: int) -> bool:
@@ -165,9 +161,8 @@ def _fit(
         if not best.exists:
             break
         parts = _find_parts(rest, _around(best, cameras, rest))
-    is_own = None if best is None else torch.isin(best.views, own.view_index)
-    if best is None or is_own is None or float(best.iou[is_own].min()) < EVIDENCE.fits:  # the outlines are certain
-        best = fit({}, None)
+    if best is None or float(best.iou[torch.isin(best.views, own.view_index)].min()) < EVIDENCE.fits:
+        best = fit({}, None)  # the outlines are certain
     return best
 
 
@@ -192,18 +187,15 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
             ids[best] = leaf
         else:
             parts[view] = leaf_colored.tighten()
-    first = int((ids == leaf).nonzero()[0, 0])
-    rows = torch.cat((torch.arange(len(masks)), torch.full((len(parts),), first)))
-    more = replace(masks, instance_ids=ids).select(rows)
-    is_new = torch.arange(len(rows)) >= len(masks)
+    first, count = int((ids == leaf).nonzero()[0, 0]), len(parts)
+    regions = _with_parts(masks.regions.select(torch.zeros(0, dtype=torch.int64)), parts)
+    new = Masks.of(regions, classes=masks.classes[first].repeat(count), origin=Origin.OTHER_VIEWS)
+    least, score = min(int(masks.proposal.min()), 0), masks.match_scores[ids == leaf].mean()
     return replace(
-        more,
-        regions=_with_parts(masks.regions, parts),
-        match_scores=torch.where(is_new, masks.match_scores[ids == leaf].mean(), more.match_scores),
-        detection_scores=torch.where(is_new, torch.nan, more.detection_scores),
-        origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
-        is_linked=more.is_linked & ~is_new,
-        proposal=torch.where(is_new, min(int(masks.proposal.min()), 0) - torch.arange(len(rows)) - 1, more.proposal),
+        Masks.concatenate((masks, new)),
+        instance_ids=torch.cat((ids, torch.full((count,), leaf))),
+        match_scores=torch.cat((masks.match_scores, score.repeat(count))),
+        proposal=torch.cat((masks.proposal, least - 1 - torch.arange(count))),
     )
 
 
@@ -231,8 +223,7 @@ def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
 
 
 def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
-    """One region for each view that has masks of a leaf: these, and those of others that touch them and may hide more
-    of it."""
+    """A region for each view with masks of a leaf: these, and others that touch them and may hide more of it."""
     hiding, regions = {}, masks.regions
     for view in masks.view_index[masks.instance_ids == leaf].unique().tolist():
         here = (masks.view_index == view).nonzero()[:, 0].tolist()

@@ -1,9 +1,7 @@
 """How well masks show surfaces: everything of a view drawn once, nearest first. Not in the paper.
 
-A surface is nearer than another as a whole, by the depth of its middle: where two leaves hide parts of each other, one
-of them is drawn wrong. Stems and pots hide nothing here. What lies behind the camera or beside the photo shows nothing.
-
-Large photos are compared at every second, third ... pixel: leaves that matter are many pixels wide all the same.
+A surface is nearer than another as a whole, by the depth of its middle. Stems and pots hide nothing here. Large photos
+are compared at every second, third ... pixel: leaves that matter are many pixels wide all the same.
 """
 
 from __future__ import annotations
@@ -21,6 +19,7 @@ from scipy.sparse import csc_array, hstack
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
+from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -87,8 +86,8 @@ def draw_views(
     first: Sequence[Drawn] = (),
     photos: ReadPhoto | None = None,
 ) -> tuple[Drawn, ...]:
-    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out. `first`: the first of
-    the regions, where these were drawn before; they are not drawn again. `photos`: of the views, for their colours."""
+    """V views of D regions and K surfaces, on the CPU. `first`: views of the first of the regions, which are not drawn
+    again; `photos`: for their colours."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
     crops = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
@@ -176,8 +175,7 @@ def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
 
 
 def see_instances(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Evidence:
-    """The evidence of D masks and the credible ones of some surfaces. The columns are instance ids, from 0 on; 0 where
-    there is nothing, and in column 0."""
+    """Evidence of D masks and the credible surfaces; columns are instance ids, from 0 on, 0 where there is nothing."""
     credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
     drawn = draw_views(regions, list(credible.values()), cameras)
     seen, by_id = see(drawn, len(regions), np.ones(len(credible), bool)), {}
@@ -185,3 +183,18 @@ def see_instances(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras
         by_id[name] = np.zeros((len(values), 1 + max(surfaces, default=0)))
         by_id[name][:, list(credible)] = values
     return Evidence(**by_id)
+
+
+def median_parallax(masks: Masks, cameras: Cameras) -> float:
+    """Degrees; median over the instances of the largest angle between two lines of sight to their masks; infinite
+    without an instance that two views show."""
+    boxes = masks.regions.boxes.double()
+    centres = torch.cat((boxes[:, :2] + boxes[:, 2:], torch.full_like(boxes[:, :1], 2)), 1) / 2
+    sights = (cameras.world_from_px[masks.view_index] @ centres[:, :, None])[..., 0]
+    sights = sights / sights.norm(dim=1, keepdim=True)
+    angles = []
+    for instance in masks.instance_ids[masks.instance_ids > 0].unique().tolist():
+        own = sights[masks.instance_ids == instance]
+        if len(own) > 1:
+            angles.append(torch.rad2deg(torch.acos((own @ own.T).clamp(-1, 1)).max()))
+    return float(torch.stack(angles).median()) if angles else float("inf")

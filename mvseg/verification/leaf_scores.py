@@ -25,13 +25,11 @@ from mvseg.verification.numbers import CHOICE
 
 @dataclass(frozen=True)
 class LeafScores:
-    """Log odds are sums of terms, by name, times their weights.
+    """Weights of the log odds' terms, by name.
 
     Attributes:
-        shows: weights of `TERMS` for a mask to show a candidate with a surface.
-        matched: the same for a candidate without one.
-        leaf: weights of `LEAF_TERMS` for a candidate with a surface to be a leaf.
-        leaf_matched: the same for a candidate without one.
+        shows, matched: of `TERMS`, for a mask to show a candidate with a surface, and without one.
+        leaf, leaf_matched: of `LEAF_TERMS`, for a candidate with a surface to be a leaf, and without one.
     """
 
     shows: dict[str, float]
@@ -61,55 +59,30 @@ FITTED = LeafScores(
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """D masks and K candidates, and all that terms of q follow from.
-
-    Attributes:
-        scores: (D,) detection scores.
-    """
+    """D masks, with detection scores (D,), and K candidates: all that terms of q follow from."""
 
     candidates: Candidates
     evidence: Evidence
     scores: Floats
 
 
-def always(pairs: Pairs) -> Floats:
-    """(D, K) 1."""
-    return np.ones_like(pairs.evidence.visible)
-
-
-def detector(pairs: Pairs) -> Floats:
-    """(D, K) log odds of the detection score."""
-    return np.broadcast_to(log_odds(pairs.scores)[:, None], pairs.evidence.visible.shape)
-
-
-def claimed(pairs: Pairs) -> Floats:
-    """(D, K) log odds of `Evidence.claimed`."""
-    return log_odds(pairs.evidence.claimed)
-
-
-def visible(pairs: Pairs) -> Floats:
-    """(D, K) log odds of `Evidence.visible`."""
-    return log_odds(pairs.evidence.visible)
-
-
-def matcher(pairs: Pairs) -> Floats:
-    """(D, K) log odds of the match score."""
-    return log_odds(np.nan_to_num(pairs.candidates.matched))
-
-
+# (D, K) each
 TERMS: dict[str, Callable[[Pairs], Floats]] = {
-    "always": always, "detection score": detector, "claimed": claimed, "visible": visible, "match score": matcher
-}  # fmt: skip
+    "always": lambda pairs: np.ones_like(pairs.evidence.visible),
+    "detection score": lambda pairs: np.broadcast_to(log_odds(pairs.scores)[:, None], pairs.evidence.visible.shape),
+    "claimed": lambda pairs: log_odds(pairs.evidence.claimed),
+    "visible": lambda pairs: log_odds(pairs.evidence.visible),
+    "match score": lambda pairs: log_odds(np.nan_to_num(pairs.candidates.matched)),
+}
 
 
 def sum_terms(weights: Mapping[str, float], terms: Mapping[str, Floats]) -> Floats:
-    """Log odds: each term that has a weight, times this; their order does not matter."""
+    """Log odds: each term that has a weight, times this."""
     return np.asarray(sum(weight * terms[name] for name, weight in sorted(weights.items())), np.float64)
 
 
 def show_chances(pairs: Pairs, fitted: LeafScores = FITTED) -> Floats:
-    """(D, K) q: how likely each mask shows each candidate. Without a surface, only the masks that were matched to a
-    candidate can; with one, those that lie in its image."""
+    """(D, K) q: with a surface, of masks in its image; without one, of the masks that were matched to the candidate."""
     candidates, terms = pairs.candidates, {name: term(pairs) for name, term in TERMS.items()}
     by_matching = np.where(np.isnan(candidates.matched), -np.inf, sum_terms(fitted.matched, terms))
     by_surface = np.where(pairs.evidence.claimed > 0, sum_terms(fitted.shows, terms), -np.inf)
@@ -124,7 +97,7 @@ class ClearLeaves:
     Attributes:
         score: median log odds of the detection scores of their masks.
         length: median, world units.
-        color: (K,) how alike the colours of each candidate are, see `MaskColors.likeness`.
+        color: (K,) of each candidate, see `MaskColors.likeness`.
     """
 
     score: float
@@ -177,44 +150,23 @@ class Met:
         return ClearLeaves(score, float(np.median(lengths)) if len(lengths) else 1.0, color)
 
 
-def _ones(met: Met, _: ClearLeaves) -> Floats:
-    return np.ones_like(met.number)
-
-
-def _coverage(met: Met, _: ClearLeaves) -> Floats:
-    return met.coverage
-
-
-def _number(met: Met, _: ClearLeaves) -> Floats:
-    return np.log(met.number + CHOICE.some)
-
-
-def _score(met: Met, clear: ClearLeaves) -> Floats:
-    return met.mean(met.scores) - clear.score
-
-
 def _length(met: Met, clear: ClearLeaves) -> Floats:
     """Pieces are short."""
     lengths = np.where(met.candidates.has_surface, met.candidates.lengths, clear.length)
     return np.minimum(np.log(np.maximum(lengths, 1e-12) / clear.length), 0.0)
 
 
-def _fit(met: Met, _: ClearLeaves) -> Floats:
-    return log_odds(met.candidates.fits)
-
-
-def _color(_: Met, clear: ClearLeaves) -> Floats:
-    return np.minimum(clear.color, 0.0)
-
-
-def _stem(met: Met, _: ClearLeaves) -> Floats:
-    return np.log(1 - np.minimum(met.candidates.stem, 1 - CHOICE.least_distance))
-
-
+# (K,) each
 LEAF_TERMS: dict[str, Callable[[Met, ClearLeaves], Floats]] = {
-    "always": _ones, "shown": _coverage, "number": _number, "detection score": _score, "length": _length, "fit": _fit,
-    "color": _color, "stem": _stem,
-}  # fmt: skip
+    "always": lambda met, _: np.ones_like(met.number),
+    "shown": lambda met, _: met.coverage,
+    "number": lambda met, _: np.log(met.number + CHOICE.some),
+    "detection score": lambda met, clear: met.mean(met.scores) - clear.score,
+    "length": _length,
+    "fit": lambda met, _: log_odds(met.candidates.fits),
+    "color": lambda _, clear: np.minimum(clear.color, 0.0),
+    "stem": lambda met, _: np.log(1 - np.minimum(met.candidates.stem, 1 - CHOICE.least_distance)),
+}
 
 
 def leaf_chances(met: Met, clear: ClearLeaves, fitted: LeafScores = FITTED) -> tuple[Floats, Floats]:
@@ -226,8 +178,7 @@ def leaf_chances(met: Met, clear: ClearLeaves, fitted: LeafScores = FITTED) -> t
 
 
 def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
-    """(V, K) the largest q (D, K) of each candidate in each view, and the row of its mask; 0 and row 0 in views without
-    masks."""
+    """(V, K) the largest q (D, K) of each candidate in each view, and the row of its mask; 0 in views without masks."""
     best, row = np.zeros((len(rows_of_views), q.shape[1])), np.zeros((len(rows_of_views), q.shape[1]), np.int64)
     for view, rows in enumerate(rows_of_views):
         if len(rows):
@@ -238,13 +189,7 @@ def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
 
 @dataclass(frozen=True)
 class Rating:
-    """Score of a pass, to compare passes over the same photos of one plant.
-
-    Attributes:
-        agreed_area: pixels, see `rate_pass`.
-        expected: expected number of correct masks, E.
-        num_leaves: accepted leaves.
-    """
+    """Score of a pass: agreed area in pixels, see `rate_pass`; expected correct masks, E; number of leaves."""
 
     agreed_area: float
     expected: float
@@ -265,9 +210,8 @@ def rate_pass(
     Args:
         masks: D masks with ids whose match scores are q.
         probabilities: {instance id: P}.
-        pixel: width of a pixel of the detector, in pixels of the photos. Where it is large, edges are coarse, and views
-            agree for that alone.
-        colored: (D,) share of each mask that has leaf colour, see `colored_shares`; None: all of it.
+        pixel: width of a pixel of the detector, in pixels of the photos: where it is large, views agree for that alone.
+        colored: (D,) share of each mask that has leaf colour; None: all of it.
     """
     num_leaves = len(masks.instance_ids[masks.instance_ids > 0].unique())
     chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)

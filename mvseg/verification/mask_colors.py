@@ -39,12 +39,8 @@ class MaskColors:
 
     def likeness(self, weights: Floats, is_clear: Bools) -> Floats:
         """(K,) how alike the colours of each candidate and of the median clear leaf are: natural logarithm of
-        Bhattacharyya's coefficient, less the median of the clear leaves. 0 where there are fewer than two of these.
-
-        Args:
-            weights: (D, K) how much each mask counts for each candidate.
-            is_clear: (K,).
-        """
+        Bhattacharyya's coefficient, less the median of the clear leaves (`is_clear`). 0 where there are fewer than two
+        of these. `weights` (D, K): how much each mask counts for each candidate."""
         shape = -1, COLORS.hues, COLORS.hues
         shares = gaussian_filter((self.counts.T @ weights).T.reshape(shape), (0, COLORS.blur, COLORS.blur))
         shares = np.sqrt(shares.reshape(len(is_clear), -1))

@@ -1,8 +1,7 @@
 """Masks that do not show their own leaf are matched once more, all others held. Not in the paper.
 
 Where leaves are dense, the masks of one leaf may be scattered: each went to a leaf that has no mask in its view, and
-along the rays it fits there. But the surface of that leaf lies elsewhere in its photo. Freed all at once, such masks
-find each other.
+along the rays it fits there, but the surface of that leaf lies elsewhere. Freed all at once, they find each other.
 """
 
 from __future__ import annotations
@@ -15,32 +14,30 @@ from torch import Tensor
 
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.errors import collect_warnings
-from mvseg.masks import Masks
+from mvseg.masks import SURE, Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.scene import Cameras
-from mvseg.verification.numbers import AGAIN
+from mvseg.verification.numbers import EVIDENCE
 
 
 def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config: MatchConfig) -> Masks | None:
-    """Match the masks that do not show their own leaf (`AGAIN.freed`), and those without one, once more.
+    """Match the masks that do not show their own leaf (by `SURE`), and those without one, once more.
 
-    All others stay together as they are, instances stay apart, and no mask goes back to the one that it was taken from
-    (`Links`).
+    All others stay together, instances stay apart, and no mask goes back to the one that it was taken from.
 
     Args:
-        masks: D masks on the CPU.
-        leaf: (D,) int64, what each mask was matched to, from 0 on; -1 for nothing.
+        leaf: (D,) int64, the leaf that each mask was matched to, from 0 on; -1 for none.
         q: (D,) how likely it shows that.
-        config: that the masks were matched with.
+        config: of the first matching.
 
     Returns:
         The same masks with the ids of new instances only, whose masks come from several leaves; None where no mask is
-        freed, with another method than "nview", and with fewer than `AGAIN.least_views` views.
+        freed, with another method than "nview", and with fewer than `EVIDENCE.least_views` views.
     """
-    is_free = (leaf < 0) | (q < AGAIN.freed)
-    has_few_views = masks.regions.num_views < AGAIN.least_views
+    is_free = (leaf < 0) | (q < SURE)
+    has_few_views = masks.regions.num_views < EVIDENCE.least_views
     if config.resolved_method != "nview" or has_few_views or not (is_free & (leaf >= 0)).any():
         return None
     with collect_warnings():  # the first matching has said it
@@ -53,8 +50,7 @@ def match_again(masks: Masks, leaf: Ints, *, q: Floats, cameras: Cameras, config
 
 
 def _comes_of_one(ids: Tensor, leaf: Ints) -> Tensor:
-    """(D,) bool, the masks of instances most of whose masks were of one leaf: that leaf again, by fewer of its
-    masks."""
+    """(D,) bool, masks of instances most of whose masks were of one leaf: that leaf again, by fewer masks."""
     is_one = torch.zeros(int(ids.max().clamp(min=0)) + 1, dtype=torch.bool)
     for instance in ids[ids > 0].unique().tolist():
         sources = leaf[(ids == instance).numpy()]

@@ -11,28 +11,15 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class EvidenceNumbers:
-    """Evidence of surfaces for masks."""
+    """Evidence of surfaces, also of rough ones, for masks."""
 
     most_px: int = 800  # limit: max. longer side of the photos on which masks are compared
     fits: float = 0.5  # definition: a mask shows a leaf if its IoU with the visible part of the leaf is larger
     open_pixels: int = 100  # chosen: min. unhidden pixels of a surface that a view sees openly
     shared: float = 0.5  # definition: fraction of the smaller of two masks that is in both, where they show one leaf
-
-
-@dataclass(frozen=True)
-class RoughNumbers:
-    """Surfaces that judge masks before ids are final."""
-
-    views: int = 12  # limit: max. views of an instance that a rough surface is fitted to
+    rough_views: int = 12  # limit: views of an instance that a rough surface is fitted to, before ids are final
     least_parallax: float = 30.0  # chosen: min. degrees between the directions that most instances are seen from
-
-
-@dataclass(frozen=True)
-class AgainNumbers:
-    """Masks that are matched again."""
-
     least_views: int = 5  # chosen: of fewer, surfaces fit wrong masks as well: two always agree
-    freed: float = 0.5  # definition: q of a mask for its own leaf below which it likelier shows another one
 
 
 @dataclass(frozen=True)
@@ -74,6 +61,7 @@ class ColorNumbers:
     blur: float = 1.0  # chosen: standard deviation of the Gaussian that smooths the counts, in bins
     hues: int = 32  # limit: bins of each of two colour channels (a and b of CIELAB) in which candidates are compared
     least_alike: float = 1e-3  # limit: Bhattacharyya's coefficient from which on colours differ entirely
+    most_px: int = 600  # limit: max. longer side of the pictures in which places without a mask are looked for
     # On plants that were found whole, 0.15 to 0.39 (stems, soil and pots), where a quarter was found, 0.48 to 0.84.
     unexplained: float = 0.5  # chosen: fraction of leaf-coloured pixels in no mask above which leaves were missed
 
@@ -90,8 +78,6 @@ class SnapNumbers:
 
 
 EVIDENCE = EvidenceNumbers()
-ROUGH = RoughNumbers()
-AGAIN = AgainNumbers()
 CHOICE = ChoiceNumbers()
 DRAWN = DrawnNumbers()
 COLORS = ColorNumbers()

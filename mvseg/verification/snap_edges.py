@@ -1,9 +1,8 @@
-"""Edges of masks follow those of colour.
+"""Edges of masks follow those of colour. Not in the paper.
 
-A mask head answers on a small grid, and surfaces are smooth: both draw outlines that lie beside the leaf's. So within
-a narrow band along a mask's outline the photo decides, by GrabCut (Rother, Kolmogorov, Blake 2004), as OpenCV has it:
-what lies deeper inside stays leaf, what lies farther outside stays background. Where other views show that a mask lacks
-a part of its leaf (`missing_parts.py`), the photo decides about that part, too. Not in the paper.
+A mask head answers on a small grid, and surfaces are smooth: both draw outlines that lie beside the leaf's. So within a
+narrow band along a mask's outline the photo decides, by GrabCut (Rother, Kolmogorov, Blake 2004). Where other views
+show that a mask lacks a part of its leaf (`missing_parts.py`), the photo decides about that part, too.
 """
 
 from __future__ import annotations
@@ -11,13 +10,14 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.arrays import Bools
+from mvseg.arrays import Bools, Pixels
 from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
@@ -25,8 +25,6 @@ from mvseg.verification.numbers import SNAP
 
 # confirmed masks are snapped too: the user saw them with the snapped edge
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])
-
-Pixels = NDArray[np.uint8]
 
 
 def snap_masks(
@@ -36,16 +34,13 @@ def snap_masks(
     missing: Sequence[Crop | None] = (),
     cache: dict[str, Bools] | None = None,
 ) -> Masks:
-    """Move the edges of the masks that a detector found to those of colour, see `snap`.
+    """Move the edges of the masks that a detector found to those of colour, see `snap`; the others stay as they are.
 
     None grows into another mask of its view, nor do two grow into the same pixel: the first row has it.
 
     Args:
-        missing: D, the part of its leaf that each mask lacks, see `find_missing_parts`; (): none lacks any.
-        cache: {digest of the arguments of `snap`: what it returned}; earlier ones are taken from it, new ones added.
-
-    Returns:
-        The same rows, on the CPU. Masks that no detector found stay as they are.
+        missing: D, see `find_missing_parts`; (): none lacks any.
+        cache: {digest of the arguments of `snap`: its answer}; learns new ones.
     """
     cache = {} if cache is None else cache
     regions = masks.regions.to("cpu")
@@ -107,9 +102,15 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools, likely: Bools | None = No
         return mask
     state = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     state[deep], state[far] = cv2.GC_FGD, cv2.GC_BGD
-    cv2.setRNGSeed(0)
-    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(small, state, None, background, foreground, 1, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
-    leaf = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.float32)
+    leaf = cut_by_color(small, state, rounds=1).astype(np.float32)
     snapped: Bools = cv2.resize(leaf, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
     return snapped & ~others
+
+
+def cut_by_color(photo: NDArray[Any], state: Pixels, *, rounds: int) -> Bools:
+    """(H, W) bool, the leaf by GrabCut in a photo (H, W, 3), from the `state` (H, W) of each pixel, which changes."""
+    cv2.setRNGSeed(0)
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
+    how = background, foreground, rounds, cv2.GC_INIT_WITH_MASK
+    cv2.grabCut(photo, state, None, *how)  # type: ignore[call-overload]
+    return (state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)

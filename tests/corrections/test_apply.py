@@ -13,10 +13,10 @@ import torch
 from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
-from mvseg.corrections.settle import settle_edits
 from mvseg.findings.finding import Finding
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
+from mvseg.pipeline.finish import settle_edits
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.verification.choose import RejectedCandidate
@@ -163,7 +163,7 @@ def test_whole_instances_once_they_are_known() -> None:
         return apply_everywhere(corrected, known)[0]
 
     assert after(at("reject", 15, 15, everywhere=True)).regions.boxes.tolist() == [[*RIGHT], [*RIGHT]]
-    assert after(at("reject", 15, 15, everywhere=True)).instance_ids.tolist() == [1, 1]
+    assert after(at("reject", 15, 15, everywhere=True)).instance_ids.tolist() == [2, 2]
     confirmed = after(at("confirm", 15, 15, everywhere=True))
     assert confirmed.origin.tolist() == [Origin.CONFIRMED, Origin.DETECTED] * 2
     both = after(at("reject", 15, 15, everywhere=True), at("confirm", 15, 15, "b", everywhere=True))

@@ -9,9 +9,9 @@ import torch
 
 from blade_scene import as_regions
 from mvseg.corrections.corrected import Corrected, Whole
-from mvseg.corrections.unchanged_leaves import leave_joined, unchanged_leaves
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
+from mvseg.pipeline.apply_edits import leave_joined, unchanged_leaves
 from three_leaves import true_maps
 
 REGIONS, IDS = as_regions(true_maps())

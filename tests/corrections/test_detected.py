@@ -70,7 +70,7 @@ def run(*edits: Edit) -> Plant:
 def known_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
     see_masks(monkeypatch, FOUND)
     monkeypatch.setattr(choosing, "fit_roughly", fit)
-    monkeypatch.setattr("mvseg.verification.leaf_color.count_colors", lambda *_: pytest.fail("no photo is needed"))
+    monkeypatch.setattr("mvseg.verification.picture.count_colors", lambda *_: pytest.fail("no photo is needed"))
 
 
 def as_painted(state: Plant) -> list[np.ndarray]:

@@ -90,7 +90,7 @@ def test_a_later_link_wins(tmp_path: Path) -> None:
     ]
     assert lost == {
         0: "same_track: contradicted by edit 4",
-        1: "same_track: contradicted by edit 3",
+        1: "same_track: contradicted by edit 4",
         4: "same_track: two leaves of one date, which are never the same",
     }
 

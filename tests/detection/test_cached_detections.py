@@ -134,11 +134,11 @@ def test_a_detector_that_proposes_masks_everywhere_is_bounded_and_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, config = load_scene(write_scene(tmp_path / "plant", 2)), DetectConfig(min_score=0.2)
-    everything = detect_scene(Photos(scene), config).proposals(scene.cameras)
+    everything = detect_scene(Photos(scene), config).proposals()
     assert everything.regions.num_per_view.min() > 2
     monkeypatch.setattr("mvseg.detection.detect_scene.DETECTION", replace(DETECTION, most_proposals=2))
     with warns_of("very_many_proposals"):
-        best = detect_scene(Photos(scene), config).proposals(scene.cameras)
+        best = detect_scene(Photos(scene), config).proposals()
     assert best.regions.num_per_view.tolist() == [2, 2]
     for view in range(2):
         scores = everything.detection_scores[everything.view_index == view]

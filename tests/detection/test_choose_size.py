@@ -44,7 +44,7 @@ def expecting(
 ) -> Any:
     rating = Rating(area, expected, leaves)
     return SimpleNamespace(
-        rating=rating, leaves=SimpleNamespace(agreement=agreement), passes=(SimpleNamespace(longest=longest),)
+        rating=rating, leaves=SimpleNamespace(agreement=agreement), detected=SimpleNamespace(longest=longest)
     )
 
 
@@ -99,7 +99,7 @@ def test_the_sizes_next_to_the_one_that_was_learned(
         looks.append(size)
         return expecting(areas[size], size)
 
-    assert choose_near(see, asked[0], most=most)[0].passes[0].longest == best
+    assert choose_near(see, asked[0], most=most)[0].detected.longest == best
     assert looks == asked
 
 

@@ -20,10 +20,9 @@ from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
-from mvseg.verification.evidence import Evidence, draw_views
+from mvseg.verification.evidence import Evidence, draw_views, median_parallax
 from mvseg.verification.leaf_scores import LEAF_TERMS, TERMS, Met, Pairs, sum_terms
-from mvseg.verification.numbers import ROUGH
-from mvseg.verification.rough_surfaces import median_parallax
+from mvseg.verification.numbers import EVIDENCE
 from three_leaves import CAMERAS, LEAVES, true_maps
 from tube_scene import BENT, tube_masks
 from warned import warns_of
@@ -317,7 +316,7 @@ def test_surfaces_judge_where_cameras_look_from_enough_sides(arc_deg: float, is_
     square[95:105, 95:105] = 1
     regions, ids = as_regions([square, square])
     matched = matched_of(proposals_of(regions, torch.full((2,), 0.8)), ids)
-    assert (median_parallax(matched, cameras) >= ROUGH.least_parallax) == is_around
+    assert (median_parallax(matched, cameras) >= EVIDENCE.least_parallax) == is_around
 
 
 @pytest.mark.parametrize(("number", "is_new"), [(15, True), (17, False)])
@@ -327,7 +326,7 @@ def test_nearly_the_same_masks_are_one_candidate(number: int, is_new: bool) -> N
     square[:10, :10] = 1
     table = proposals_of(as_regions([square] * 20)[0], torch.full((20,), 0.8))
     found = [matched_of(table, torch.where(torch.arange(20) < n, 1, -1)) for n in (20, number)]
-    candidates = gather_candidates(found, [torch.arange(20)] * 2, table=table, fit=None)
+    candidates = gather_candidates(found, table, None)
     assert len(candidates) == 1 + is_new
 
 
@@ -344,8 +343,7 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
     proposals = proposals_of(every, torch.full((len(every),), 0.8))
     matched = matched_of(proposals, torch.arange(1, 4).repeat_interleave(len(cameras)))
     judges = Judges(cameras)
-    rows = [matched.proposal]
-    stem = gather_candidates([matched], rows, table=proposals, fit=judges.fit).stem
+    stem = gather_candidates([matched], proposals, judges.fit).stem
     leaves = choose_leaves(proposals, [matched], judges)
     is_stem_told = max(half_widths) > 0.2
     assert (stem[:2] < 0.01).all()

@@ -55,8 +55,7 @@ def test_the_other_views_show_it(
 ) -> None:
     scene, truth = plant
     before = drawn(truth, leaf, views, missed=missed)
-    after, surfaces = follow_drawn(before, cameras=scene.cameras, photos=photos)
-    assert list(surfaces) == [leaf]
+    after = follow_drawn(before, cameras=scene.cameras, photos=photos)
     for name in ("instance_ids", "origin", "view_index"):
         assert torch.equal(getattr(after, name)[: len(before)], getattr(before, name))
     is_new = torch.arange(len(after)) >= len(before)
@@ -83,7 +82,7 @@ def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(
     lost = truth.select((truth.labels == 10) & (truth.view_index == 2))
     other = replace(Masks.of(lost), is_linked=torch.tensor([is_linked]))
     both = Masks.concatenate((masks, other))
-    after, _ = follow_drawn(both, cameras=scene.cameras, photos=photos)
+    after = follow_drawn(both, cameras=scene.cameras, photos=photos)
     assert after.instance_ids[len(masks)] == (-1 if is_linked else 10)
     assert after.origin[len(masks)] == Origin.GIVEN
     assert 2 not in after.view_index[len(both) :].tolist()
@@ -96,9 +95,7 @@ def test_nothing_is_looked_for_without_need(plant: tuple[Scene, Regions], photos
         drawn(truth, 10, tuple(range(9))),
         drawn(truth, 10, (4, 8)).select(torch.zeros(0, dtype=torch.int64)),
     ):
-        after, surfaces = follow_drawn(masks, cameras=scene.cameras, photos=photos)
-        assert len(after) == len(masks)
-        assert surfaces == {}
+        assert len(follow_drawn(masks, cameras=scene.cameras, photos=photos)) == len(masks)
 
 
 def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions], photos: ReadPhoto) -> None:
@@ -109,7 +106,7 @@ def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]
     wrong = Masks.of(other, torch.tensor([10]), origin=Origin.CORRECTED)
     both = Masks.concatenate((masks.select(~((masks.view_index == 8) & (masks.instance_ids == 3))), wrong))
     both = replace(both, instance_ids=torch.where(torch.arange(len(both)) == len(both) - 1, 10, both.instance_ids))
-    after, _ = follow_drawn(both, cameras=scene.cameras, photos=photos)
+    after = follow_drawn(both, cameras=scene.cameras, photos=photos)
     for name in ("instance_ids", "origin", "match_scores"):
         assert torch.equal(getattr(after, name)[: len(both)], getattr(both, name))
 
@@ -132,7 +129,7 @@ def follow_painted(view: int, *, colored: float = 1.0, visible: float = 1.0) -> 
     given = matched(regions, ids).masks
     given = replace(given, origin=torch.where(ids == 3, int(Origin.CORRECTED), int(Origin.GIVEN)))
     photos = [np.where(labels[..., None] > 0, GREEN, BROWN).astype(np.uint8) for labels in painted]
-    after, _ = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
+    after = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
     return after.view_index[(after.origin == Origin.OTHER_VIEWS) & (after.instance_ids == 3)].tolist()
 
 
@@ -159,7 +156,7 @@ def test_half_masks_of_a_drawn_leaf_go(share: float, goes: bool) -> None:
     is_drawn = (ids == 3) & torch.isin(regions.view_index, torch.tensor([0, 3]))
     given = replace(given, origin=torch.where(is_drawn, int(Origin.CORRECTED), int(Origin.GIVEN)))
     photos = [np.where(labels[..., None] > 0, GREEN, BROWN).astype(np.uint8) for labels in whole]
-    after, _ = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
+    after = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
     is_leaf = after.instance_ids == 3
     is_other = (given.instance_ids != 3).nonzero()[:, 0]
     assert sorted(after.view_index[is_leaf].tolist()) == list(range(6))

@@ -82,7 +82,6 @@ def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> No
     over = flat_leaf(length=0.8, half_width=0.35, at=(-0.8, -0.3, 0.42))
     checked = check(regions, ids, LEAVES | {4: over})
     assert torch.equal(checked.instance_ids, leaves)
-    assert torch.equal(checked.close_gaps().instance_ids, leaves)
 
 
 def test_masks_that_a_detector_found_are_held_as_given_ones_are(scene: tuple[Regions, Tensor]) -> None:

@@ -19,8 +19,8 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import check_result, shape_leaves
-from mvseg.verification.numbers import EVIDENCE
-from mvseg.verification.unexplained import find_missing, share_unexplained
+from mvseg.verification.numbers import COLORS
+from mvseg.verification.picture import find_missing, share_unexplained
 from three_leaves import true_maps
 from warned import warns_of
 
@@ -49,7 +49,7 @@ def test_the_share_is_that_of_the_pixels(leaves: tuple[int, ...]) -> None:
 
 def test_thinned_photos_say_nearly_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = share_unexplained(found((2,)), photo)
-    monkeypatch.setattr("mvseg.verification.unexplained.EVIDENCE", replace(EVIDENCE, most_px=SIZE // 2))
+    monkeypatch.setattr("mvseg.verification.picture.COLORS", replace(COLORS, most_px=SIZE // 2))
     assert share_unexplained(found((2,)), photo) == pytest.approx(whole, abs=0.01)
 
 

@@ -453,7 +453,7 @@ def test_a_leaf_with_half_masks_is_outlined_in_both_photos(
 def offered(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the balls without the third, which is a candidate that was not chosen."""
     is_third = balls.masks.instance_ids == 3
-    masks = balls.masks.select(~is_third).close_gaps()
+    masks = balls.masks.select(~is_third)
     left = (RejectedCandidate(0.4, balls.masks.select(is_third)),)
     result = replace(balls, matching=balls.matching.with_masks(masks), instances=Instances(), rejected=left)
     return write_page(tmp_path_factory.mktemp("offered") / "report.html", result)
