@@ -538,14 +538,14 @@ def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
 @pytest.mark.slow
 def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
-    config = RunConfig(reconstruct=None, scale=0.1, unit="cm")
-    run_one_scene(RunRequest(scene, scene / "masks", out, config))
+    voxels = replace(RunConfig().reconstruct, shape="voxels", voxel_budget=8000)
+    run_one_scene(RunRequest(scene, scene / "masks", out, RunConfig(reconstruct=voxels, scale=0.1, unit="cm")))
     before = json.loads((out / "run.json").read_text())["config"]
     with serve(out) as server:
         view, at = middle(server.corrector.opened, 0)
         save(server, [{"op": "confirm", "view": view, "at": at}])
-        status, answer = ask(server, "POST", "whole")
-        assert status == 200, answer
+        assert ask(server, "POST", "whole") == (200, {})
+        assert all(text in ask(server, "GET", "")[1] for text in ('"plantTraits":[{', '"before":"3 leaves in 4 photos'))
     run = json.loads((out / "run.json").read_text())
     assert [each["fate"] for each in run["corrections"]] == ["applied"]
     after = run["config"]
@@ -687,9 +687,9 @@ def test_a_leaf_that_goes_with_an_edit_of_another_is_named(served: CorrectionSer
     ("drawn", "stays", "apart", "end"),
     [
         ("ab", "abc", 30, "drawn in 2 photos, found in 1 of 2 others."),
-        ("ab", "ab", 6, "others: they are 6 degrees apart. Outline it in a photo 20 to 60 degrees away, too."),
+        ("ab", "ab", 6, "they are 6 degrees apart. All photos are within 6 degrees: outline it in more of them."),
         ("ab", "ab", 40, "others: its shape fits no other photo. Outline it in a photo 20 to 60 degrees away, too."),
-        ("a", "a", 0, "of 3 others: one photo tells no shape. Outline it in a photo 20 to 60 degrees away, too."),
+        ("a", "a", 30, "of 3 others: one photo tells no shape. Outline it in a photo 20 to 60 degrees away, too."),
     ],
 )
 def test_outlines_say_where_their_leaf_was_found_or_why_not(drawn: str, stays: str, apart: int, end: str) -> None:

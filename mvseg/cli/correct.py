@@ -63,7 +63,7 @@ def run(args: Namespace) -> int:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
-            if opened.learner is not None and opened.learner.is_learned:
+            if opened.learner is not None and opened.learner.learned is not None:
                 say("\nWhat the detector has learned is in the whole result, if the page made it since.")
             what, verb = ("tables and page", "track") if has_tracks else ("whole result", "infer")
             again = ["--again", str(folder.resolve()), "--corrections", str(folder.resolve() / CORRECTIONS_FILE)]

@@ -13,6 +13,7 @@ from mvseg.reconstruction.stem.stem_axis import sweep_circle
 from mvseg.traits.nodes import Stem
 
 STEM_COLOR, PETIOLE_COLOR = (126, 104, 66), (170, 176, 120)  # definition: of stems, and of petioles, which are guessed
+SURE_STEM = 0.9  # chosen: probability from which a stem is drawn as one line, not dashed
 STEM_WIDTH, PETIOLE_WIDTH = 0.012, 0.006  # definition: radius where it is not known, in lengths of the stem
 
 
@@ -26,6 +27,7 @@ class StemPart:
         points: (P, 3) along it.
         radius: (P,).
         color: RGB, 0 to 255.
+        is_guessed: a petiole, or a stem that is less likely than `SURE_STEM`.
     """
 
     name: str
@@ -33,6 +35,7 @@ class StemPart:
     points: NDArray[np.float64]
     radius: NDArray[np.float64]
     color: tuple[int, int, int]
+    is_guessed: bool = True
 
     def mesh(self) -> trimesh.Trimesh:
         return sweep_circle(self.points, self.radius)
@@ -42,7 +45,7 @@ def stem_parts(stem: Stem) -> Iterator[StemPart]:
     """A stem, as thick as masks show it, and thin straight tubes from its nodes to the blades: petioles are guessed."""
     length = max(stem.axis.length, 1e-300)
     radius = stem.axis.radius if stem.axis.radius.any() else np.full(len(stem.axis.points), STEM_WIDTH * length)
-    yield StemPart(f"stem_{stem.number}", None, stem.axis.points, radius, STEM_COLOR)
+    yield StemPart(f"stem_{stem.number}", None, stem.axis.points, radius, STEM_COLOR, stem.probability < SURE_STEM)
     for node in stem.nodes:
         ends = np.array([node.place, node.base])
         if np.linalg.norm(ends[1] - ends[0]) > PETIOLE_WIDTH * length:

@@ -239,7 +239,7 @@ class Corrector:
         if (learner := self.opened.learner) is None:
             return None
         seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * len(learner.scene.views)
-        return {"now": doing, "isLearned": learner.is_learned, "seconds": seconds}
+        return {"now": doing, "isLearned": learner.learned is not None, "seconds": seconds}
 
     def _learner(self) -> OpenResult:
         if (learner := self.opened.learner) is None:
@@ -271,7 +271,7 @@ class Corrector:
         """Go back to the detector before it learned. Raises Refused: there is no detector; it learns."""
         with self.news:
             self._refuse_while_learning()
-            if (learner := self._learner()).is_learned:
+            if (learner := self._learner()).learned is not None:
                 learner.unlearn()
                 self._compute_anew()
                 self._notify()

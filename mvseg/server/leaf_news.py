@@ -14,7 +14,6 @@ from mvseg.corrections.file import Edit, Outline
 from mvseg.masks import Origin
 from mvseg.results.result import Result
 
-LEAST_APART = 15  # chosen: degrees between two photos from which outlines in both tell a shape
 PARTNERS = 20, 60  # chosen: degrees between two photos that both show a leaf, and tell its shape
 
 
@@ -48,7 +47,10 @@ def tell_drawn(result: Result, *, new: Sequence[Edit], angles: NDArray[np.int64]
         if not found:
             widest = max((int(angles[pair]) for pair in combinations(outlined, 2)), default=0)
             why = "one photo tells no shape" if len(outlined) == 1 else f"they are {widest} degrees apart"
-            why = why if widest < LEAST_APART else "its shape fits no other photo"
-            sentence += f": {why}. Outline it in a photo {PARTNERS[0]} to {PARTNERS[1]} degrees away, too"
+            why = why if widest < PARTNERS[0] else "its shape fits no other photo"
+            advice = f"Outline it in a photo {PARTNERS[0]} to {PARTNERS[1]} degrees away, too"
+            if (walked := int(angles.max())) < PARTNERS[0]:
+                advice = f"All photos are within {walked} degrees: outline it in more of them"
+            sentence += f": {why}. {advice}"
         sentences.append(f"{sentence}.")
     return sentences

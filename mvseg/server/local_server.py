@@ -62,15 +62,9 @@ class _Handler(BaseHTTPRequestHandler):
             place: partial(lambda answer: self._json(answer(self._body())), answer)
             for place, answer in corrector.opened.answers.items()
         }
-        self._answer(
-            {
-                **asked,
-                "whole": lambda: self._json(corrector.whole()),
-                "learn": lambda: self._json(corrector.learn()),
-                "cancel": lambda: self._json(corrector.cancel()),
-                "unlearn": lambda: self._json(corrector.unlearn()),
-            }
-        )
+        for act in (corrector.whole, corrector.learn, corrector.cancel, corrector.unlearn):
+            asked[act.__name__] = partial(lambda act: self._json(act()), act)
+        self._answer(asked)
 
     def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
         try:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cached_property
-from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
@@ -45,6 +44,7 @@ from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.leaf_news import tell_drawn, tell_vanished
 from mvseg.server.saved_edits import CORRECTIONS_FILE, Update
+from mvseg.server.stable_numbers import give_numbers
 from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
@@ -82,17 +82,13 @@ class OpenResult:
         self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self._before: tuple[Plant, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
+        self.summary_before = ""  # of the result that the newest whole one replaced
         self.learned: tuple[Plant, list[Finding]] | None = None  # since the detector learned the plant
 
     @property
     def learner(self) -> OpenResult | None:
         """Itself, where there is a detector that may learn, and views choose what it finds."""
         return None if self.opened.holds else self
-
-    @property
-    def is_learned(self) -> bool:
-        """Whether the detector has learned the plant since this was opened."""
-        return self.learned is not None
 
     def read_edits(self) -> tuple[Corrections, str]:
         found = self.saved_corrections()
@@ -105,15 +101,15 @@ class OpenResult:
         return with_marks(corrections, self.scene, self.marks)
 
     def page(self, corrections: Corrections) -> str:
-        shown, pictures = self._page_result
-        shown = replace(shown, corrections=corrections)
-        return build_page(shown, pictures, run=self.run.record.as_json(), is_served=True)
+        run, (result, pictures) = self.run.record.as_json(), self._page_result
+        run["card"] = {**(run.get("card") or {}), "before": self.summary_before}
+        return build_page(replace(result, corrections=corrections), pictures, run=run, is_served=True)
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         result, outcomes, messages = self.recompute(corrections, is_old)
         made_with = () if self._saved.corrections is None else self._saved.corrections.edits
         if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
-            result = replace(result, instances=replace(result.instances, traits=self._saved.traits))
+            result = replace(result, instances=self._saved.instances)
         sizes = result.scene.cameras.sizes.tolist()
         pictures = [
             picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
@@ -125,6 +121,7 @@ class OpenResult:
         vanished = tell_vanished(before, result, new=new)
         news = describe_update(result, pictures)
         news["told"] = tell_drawn(result, new=new, angles=measure_angles(result))
+        news["agreedArea"] = () if self.learned is None else self.learned[0].learned.agreed_area
         self._page_result = result, pictures
         yield Update(news, outcomes, vanished + messages)
         if not self.opened.holds:
@@ -148,14 +145,15 @@ class OpenResult:
     def saved_result(self) -> Result:
         """The result as it lies in the folder, for the page to begin with; without masks where it shows other views, or
         another version of mvseg wrote it in a way that this one cannot read."""
-        nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(self.scene.views)))
-        try:
+        saved, names = None, [view.name for view in self.scene.views]
+        with suppress(InputError):
             saved = load_result(self.folder)
-        except InputError:
+        if saved is None or [view.name for view in saved.scene.views] != names:
+            nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(names)))
             return Result(self.scene, Matching(nothing, MatchReport("none")))
-        if [view.name for view in saved.scene.views] != [view.name for view in self.scene.views]:
-            return Result(self.scene, Matching(nothing, MatchReport("none")))
-        return keep_numbers(replace(saved, scene=self.scene, photos=self.photos), self._numbers)
+        ids = zip(name_regions(saved.regions), saved.masks.instance_ids.tolist(), strict=True)
+        self._numbers.update({name: number for name, number in ids if number > 0})
+        return replace(saved, scene=self.scene, photos=self.photos)
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels, bit for bit that of `mvseg infer --again`:
@@ -200,7 +198,9 @@ class OpenResult:
 
     def reopened(self) -> OpenResult:
         """The result as it is in the folder now."""
-        return OpenResult(self.folder)
+        opened = OpenResult(self.folder)
+        opened.summary_before = (self.run.record.as_json().get("card") or {}).get("found", "")
+        return opened
 
     def _again_with(self, place: Path) -> list[str]:
         weights = self._detector if self.learned is None else self.learned[0].learned.weights
@@ -268,8 +268,7 @@ def _read_detector(folder: Path) -> bytes | None:
 
 
 def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | None = None) -> Result:
-    """Give leaves the numbers that most of their masks' pixels had last, and the others new ones, in their order. So
-    ids may have gaps.
+    """Give leaves the numbers that most of their masks' pixels had last, and the others new ones, see `give_numbers`.
 
     Args:
         number_of: {name of a mask: number of its leaf}; learns those of the result.
@@ -289,13 +288,7 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
             for other in beside.nonzero()[:, 0].tolist():
                 if previous.regions.placed(other).iou(mask) > EVIDENCE.fits:
                     votes[instance, int(previous.instance_ids[other])] += area
-    numbers: dict[int, int] = {}
-    for instance, number in sorted(votes, key=lambda pair: (-votes[pair], pair)):
-        if instance not in numbers and number not in numbers.values():
-            numbers[instance] = number
-    new = count(max(number_of.values(), default=0) + 1)
-    for instance in sorted({each[0] for each in named} - set(numbers)):
-        numbers[instance] = next(new)
+    numbers = give_numbers(votes, {each[0] for each in named}, number_of.values())
     number_of.update({name: numbers[instance] for instance, _, name, _ in named})
 
     kept = replace(masks, instance_ids=torch.tensor([numbers.get(each, -1) for each in ids]).to(masks.instance_ids))

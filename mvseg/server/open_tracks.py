@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import list_some
 from mvseg.server.saved_edits import CORRECTIONS_FILE, Update
+from mvseg.server.stable_numbers import give_numbers
 from mvseg.system.running import Cancelled
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.numbers import PAGE
@@ -41,6 +43,7 @@ class OpenTracks:
         self.recorded = read_recorded_tracks(folder)
         self.plant = _choose_plant(self.recorded, plant)
         self.dates = self.plant.read(pictures=PAGE.large_side)
+        self._numbers: dict[tuple[int, int], int] = {}  # track that each (date, leaf) showed last
         self._page = self._track(self._links(self.read_edits()[0])[0])
 
     def read_edits(self) -> tuple[Corrections, str]:
@@ -58,7 +61,7 @@ class OpenTracks:
     def page(self, corrections: Corrections) -> str:
         correct = {
             "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
-            "revision": name_edits(corrections.edits),
+            "revision": name_edits(corrections.edits), "folder": str(self.folder.resolve()),
         }  # fmt: skip
         return build_tracks_page(self.plant.plant, self._page.data | {"correct": correct})
 
@@ -89,7 +92,7 @@ class OpenTracks:
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
     def _track(self, links: Sequence[LeafLink]) -> _TracksPage:
-        tracks = self._track_with(links)
+        tracks = keep_track_numbers(self._track_with(links), self._numbers)
         data = describe_tracks(tracks, measure_growth(tracks))
         data["questions"] = [_describe_question(each) for each in list_questions(tracks, links)]
         return _TracksPage(tracks, data)
@@ -102,6 +105,19 @@ class OpenTracks:
             other = question.link(self._page.tracks, is_same=not question.is_linked)
             return describe_changes(self._page.tracks, self._track_with([*links, other]))
         return []
+
+
+def keep_track_numbers(tracks: Tracks, number_of: dict[tuple[int, int], int]) -> Tracks:
+    """Give tracks the numbers that most of their leaves had last, and the others new ones, see `give_numbers`.
+    `number_of` learns those of (date, leaf)."""
+    observed = {(row.date, row.leaf): row for row in tracks.rows if row.leaf is not None}
+    votes = Counter[tuple[int, int]]()
+    for leaf in observed.keys() & number_of.keys():
+        votes[observed[leaf].track, number_of[leaf]] += 2 * len(tracks.dates) - leaf[0]  # of one and one, the earlier
+    numbers = give_numbers(votes, {row.track for row in tracks.rows}, number_of.values())
+    number_of.update({leaf: numbers[row.track] for leaf, row in observed.items()})
+    rows = (replace(row, track=numbers[row.track]) for row in tracks.rows)
+    return replace(tracks, rows=tuple(sorted(rows, key=lambda row: (row.date, row.track))))
 
 
 def _choose_plant(recorded: RecordedTracks, name: str | None) -> PlantResults:

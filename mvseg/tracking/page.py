@@ -23,7 +23,8 @@ from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
 ASSETS = files("mvseg.tracking") / "assets"
-SERVED_SCRIPTS = ("selection.js", "numbers.js", "edits.js", "server.js")  # of the page that corrects a result
+SHARED_SCRIPTS = ("selection.js", "figures.js")  # with the page of a result
+SERVED_SCRIPTS = ("numbers.js", "edits.js", "server.js")  # of the page that corrects a result
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
@@ -36,7 +37,7 @@ def build_tracks_page(plant: str, data: Mapping[str, Any]) -> str:
     """The page; `data` of `describe_tracks`, with "correct" where `mvseg correct` serves it: {"edits", "revision", and
     the rest that its script reads}."""
     is_served = "correct" in data
-    scripts = [REPORT_ASSETS / name for name in SERVED_SCRIPTS] if is_served else []
+    scripts = [REPORT_ASSETS / name for name in (*SHARED_SCRIPTS, *(SERVED_SCRIPTS if is_served else ()))]
     styles = ["tracks.css", *(["tracks_correct.css"] if is_served else [])]
     scripts += [ASSETS / name for name in ("tracks.js", *(("tracks_correct.js",) if is_served else ()))]
     return Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
@@ -102,7 +103,7 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         "knows_up": all(date.knows_up for date in tracks.dates),
         "leaves": leaves,
         "gaps": [[row.date, row.track, row.state] for row in tracks.rows if row.leaf is None],
-        "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in range(1, tracks.num_tracks + 1)},
+        "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in sorted({row.track for row in tracks.rows})},
         "warnings": list(map(str, tracks.findings)),
     } | _describe_growth(growth)
 

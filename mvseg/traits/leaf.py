@@ -50,7 +50,7 @@ def missing(reason: str) -> Measurement:
     return Measurement(float("nan"), float("nan"), reason)
 
 
-UP_UNKNOWN = missing("not measured: the direction of up is not known (--up)")
+UP_UNKNOWN = missing("not measured: up is unknown (--up), and no stem tells it")
 STEEP = missing("not measured: the leaf points nearly straight up or down")
 BASE_UNKNOWN = missing("not measured: base and tip cannot be told apart")
 NEED_BASE = ("base_inclination", "tip_inclination", "azimuth", "insertion_height", "insertion_angle")

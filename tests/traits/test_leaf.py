@@ -189,7 +189,7 @@ def test_unknown_up_empties_what_needs_it() -> None:
     numbers = measure_leaf(bent_blade(), None)
     assert numbers.keys() == {trait.name for trait in SURFACE_TRAITS}
     assert {name for name, number in numbers.items() if not number.exists} == set(NEED_UP)
-    assert all("up is not known" in numbers[name].method for name in NEED_UP)
+    assert all("up is unknown" in numbers[name].method for name in NEED_UP)
     assert numbers["curvature"].value == pytest.approx(measure(bent_blade())["curvature"])
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.checks.cameras import find_coverage
 from mvseg.corrections.corrected import APPLIED, PASSED, Fate
 from mvseg.corrections.file import dump_edits, name_edits
 from mvseg.corrections.mask_questions import MaskQuestion, list_mask_questions
@@ -48,14 +49,10 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
 
 
 def measure_angles(result: Result) -> NDArray[np.int64]:
-    """(V, V) degrees between the directions from which two photos show the middle of the plant's surfaces; without any,
-    between the directions in which they look."""
+    """(V, V) degrees between the directions from which two photos show the point that most cameras look at, as the
+    finding `one_sided` measures them."""
     cameras = result.scene.cameras.to("cpu")
-    shapes = [each for each in (result.surfaces or {}).values() if each.exists]
-    sights = -cameras.R[:, 2].numpy()
-    if shapes:
-        middle = np.mean([each.midrib.numpy().mean(0) for each in shapes], axis=0)
-        sights = cameras.centers.numpy() - middle
+    sights = cameras.centers.numpy() - find_coverage(cameras).point
     sights = sights / np.maximum(np.linalg.norm(sights, axis=1, keepdims=True), 1e-300)
     return np.degrees(np.arccos(np.clip(sights @ sights.T, -1, 1))).round().astype(np.int64)
 

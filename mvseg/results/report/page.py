@@ -25,8 +25,9 @@ from mvseg.results.result import Result
 
 ASSETS = files("mvseg.results.report") / "assets"
 SCRIPTS = (
-    "selection.js", "numbers.js", "shapes.js", "stems.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js",
-    "lens.js", "edits.js", "brush.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
+    "selection.js", "numbers.js", "figures.js", "shapes.js", "stems.js", "space.js", "photos.js", "table.js", "leaf.js",
+    "run.js", "lens.js", "edits.js", "brush.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js",
+    "page.js",
 )  # fmt: skip
 RUN_FIELDS = (
     "card", "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "findings", "inputs",

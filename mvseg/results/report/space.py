@@ -63,10 +63,12 @@ def describe_space(result: Result) -> dict[str, Any]:
     meshes = small_meshes(result)
     frame = find_frame(result.scene, meshes)
     placed = {leaf: frame.place(mesh.vertices) for leaf, mesh in meshes.items()}
+    nodes = [] if result.traits is None else [node for stem in result.traits.stems for node in stem.nodes]
     low = min((float(points[:, 1].min()) for points in placed.values()), default=-1.0)
     return {
         "leaves": {leaf: _encode(placed[leaf], mesh) for leaf, mesh in meshes.items()},
         "stems": [_describe_part(part, frame) for part in parts_of(result)],
+        "nodes": [{"leaf": each.leaf, "at": _rounded(frame.place(np.array([each.place]))[0])} for each in nodes],
         "cameras": describe_cameras(result.scene.cameras, frame),
         "ground": round(low, 4),
         "grid": grid_step(frame.radius),
@@ -135,8 +137,8 @@ def grid_step(radius: float) -> float:
 
 def _describe_part(part: StemPart, frame: Frame) -> dict[str, Any]:
     mesh = part.mesh()
-    about: dict[str, Any] = {"color": f"#{bytes(part.color).hex()}"} | _encode(frame.place(mesh.vertices), mesh)
-    return about if part.leaf is None else about | {"leaf": part.leaf}
+    about = {"color": f"#{bytes(part.color).hex()}", "leaf": part.leaf, "isGuessed": part.is_guessed}
+    return about | _encode(frame.place(mesh.vertices), mesh)
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:

@@ -30,7 +30,8 @@ def draw_lines(result: Result, view: int, picture: Picture) -> list[dict[str, An
         if (cam[:, 2] > 0).all():
             places = np.round((cam[:, :2] / cam[:, 2:] - corner) * scale).astype(int).tolist()
             path = "M" + "L".join(f"{x} {y}" for x, y in places)
-            lines.append({"path": path} | ({} if part.leaf is None else {"leaf": part.leaf}))
+            line = {"path": path, "isGuessed": part.is_guessed}
+            lines.append(line if part.leaf is None else line | {"leaf": part.leaf})
     return lines
 
 
@@ -40,16 +41,11 @@ def describe_stems(result: Result) -> list[dict[str, Any]]:
     for stem in () if result.traits is None else result.traits.stems:
         suggested = stem.phyllotaxis
         nodes = [
-            {"leaf": node.leaf, "node": node.number}
-            | {name: short_number(getattr(node, name).value) for name in ("height", "node_azimuth")}
-            | {"sd": short_number(node.height.sd)}
+            {"leaf": node.leaf, "node": node.number, "azimuth": short_number(node.node_azimuth.value)}
+            | {"height": short_number(node.height.value), "sd": short_number(node.height.sd)}
             for node in stem.nodes
         ]
-        about: dict[str, Any] = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
-        about["chance"] = round(stem.probability, 3)
-        if np.isfinite(suggested.probability):
-            about["probability"] = round(suggested.probability, 3)
-        if np.isfinite(suggested.angle):
-            about["angle"] = suggested.angle
-        stems.append(about)
+        phyllotaxis = {"angle": short_number(suggested.angle), "probability": short_number(suggested.probability)}
+        about = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
+        stems.append(about | phyllotaxis | {"chance": short_number(stem.probability)})
     return stems

@@ -142,8 +142,9 @@ function buildTable() {
   make("th", "leaf", head);
   data.dates.forEach((date) => make("th", date.written, head));
   const body = make("tbody", undefined, table), rows = {};
-  find("ranks").textContent = data.knows_up ? "leaves are numbered from below, by the mean height of the base; tables and CSV have the same numbers (track)"
-    : "leaves are numbered in the order of appearance (track), as up is not known";
+  find("ranks").textContent = data.correct ? "leaves keep their numbers while links are corrected; written tables number them anew"
+    : data.knows_up ? "leaves are numbered from below, by the mean height of the base; tables and CSV have the same numbers (track)"
+    : "leaves are numbered in the order of appearance (track), as up is unknown";
   for (const track of tracks) {
     rows[track] = make("tr", undefined, body);
     rows[track].dataset.track = track;
@@ -190,11 +191,13 @@ function drawChart() {
   }
   drawDays(x, [left, right], wide);
   svg("text", { x: left, y: 12 }, trait.replaceAll("_", " ") + (of.unit ? ` (${withUnit("", of.unit).trim()})` : "") + " \u00b1 1 sd");
+  const ends = [];
   for (const [track, points] of shown) {
     const at = points.map(([date, value, sd]) => [x(data.dates[date].time), y(value - sd), y(value + sd), y(value)]);
-    const color = data.colors[track] || "currentColor";
+    const color = data.colors[track] ? inkOf(data.colors[track]) : "currentColor";
+    if (at.length && track !== "0") ends.push({ track, x: at.at(-1)[0] + 9, y: at.at(-1)[3] + 4, color });
     const band = [...at.map((p) => `${p[0]},${p[1]}`), ...[...at].reverse().map((p) => `${p[0]},${p[2]}`)];
-    svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.12 });
+    svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.15, class: "band" });
     svg("polyline", { points: at.map((p) => `${p[0]},${p[3]}`).join(" "), fill: "none", stroke: color, "stroke-width": 2 });
     const born = data.leaves.find((leaf) => leaf.track === Number(track) && leaf.state === "born");
     at.forEach((p, n) => {
@@ -208,6 +211,17 @@ function drawChart() {
       svg("path", { d: `M${px - 4},${py - 4}l8,8m0,-8l-8,8`, stroke: color, "stroke-width": 2, class: "gone" });
     }
   }
+  writeEnds(ends);
+}
+
+// The number of each leaf at the end of its line; none over another.
+function writeEnds(ends) {
+  ends.sort((one, other) => other.y - one.y);
+  ends.forEach((end, n) => {
+    const below = ends.slice(0, n).filter((one) => Math.abs(one.x - end.x) < 16);
+    end.y = Math.min(end.y, ...below.map((one) => one.y - 11));
+    svg("text", { x: end.x, y: end.y, class: "end", style: `fill: ${end.color}` }, end.track);
+  });
 }
 
 // The axis of days, and under it a photo of each date that has room.
@@ -271,6 +285,7 @@ for (const [label, of] of [["leaves", data.numbers], ["the whole plant", data.wh
   group.label = label;
   for (const trait of Object.keys(of)) make("option", trait.replaceAll("_", " "), group).value = trait;
 }
+find("chart-save").append(...exportButtons(() => `${data.plant}_${find("trait").value.replaceAll(" ", "_")}`, () => find("chart")));
 addEventListener("resize", drawChart);
 find("trait").addEventListener("change", drawChart);
 find("turn").addEventListener("input", drawDates);

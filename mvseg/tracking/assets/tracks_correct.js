@@ -16,6 +16,8 @@ class TrackWork {
       this.changed();
     });
     this.server = new Server(this);
+    this.note = window.sessionStorage.getItem("mvseg-whole") ?? ""; // said before the page was loaded anew
+    window.sessionStorage.removeItem("mvseg-whole");
     document.addEventListener("keydown", (event) => this.press(event));
     this.markTable();
     this.changed();

@@ -165,7 +165,7 @@ def test_an_outline_is_drawn_in_one_go_or_by_its_corners(opened: Person, tmp_pat
     assert free["leaf"] == HOSTILE
     assert len(free["polygon"]) >= 20
     assert len(clicked["polygon"]) == 3
-    assert "leaf" not in clicked
+    assert clicked["leaf"] == HOSTILE  # the name is in the field already
     sizes = opened.page.evaluate("data.correct.views[1].size"), opened.page.evaluate("data.views[1].box")
     back = opened.page.evaluate(
         "(points) => points.map((point) => modes.work.frames[1].toPicture(point))", clicked["polygon"]

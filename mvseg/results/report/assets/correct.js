@@ -18,9 +18,10 @@ class Work {
     this.panes = [new Pane(this), new Pane(this)];
     this.active = this.panes[0];
     document.getElementById("panes").append(...this.panes.map((pane) => pane.element));
+    const names = shortNames(data.views.map(({ name }) => name));
     this.thumbnails = data.views.map((view, index) => {
       const image = element("img", { src: addresses.thumbnails[index], alt: "", draggable: "false" });
-      const one = element("button", { type: "button", title: view.name }, image, element("span", {}, view.name));
+      const one = element("button", { type: "button", title: view.name }, image, element("span", {}, names[index]));
       one.addEventListener("click", () => this.active.show(index));
       return one;
     });
@@ -229,10 +230,22 @@ class Work {
   // A candidate becomes a leaf, by an outline of each of its masks under one new name; or none.
   offeredEdits(op, outlines) {
     if (op === "reject") return [{ ...this.noLeafIn(outlines[0]), everywhere: true }];
+    const name = this.freeName("offered");
+    return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, name));
+  }
+
+  freeName(word) {
     const used = new Set(this.edits.list.map((edit) => edit.leaf));
     let number = 1;
-    while (used.has(`offered ${number}`)) number += 1;
-    return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, `offered ${number}`));
+    while (used.has(`${word} ${number}`)) number += 1;
+    return `${word} ${number}`;
+  }
+
+  // The name that is in the field: that of the leaf whose outline in another photo comes first, or else a new one.
+  nameOf(view) {
+    const { name } = this.data.views[view];
+    if (this.doubt && this.doubt.kind !== "place") return ""; // an answer shows what was asked about
+    return this.partner && this.partner.view !== name ? this.partner.leaf : this.freeName("new");
   }
 
   // An outline that the user draws: the answer to a question shows what that asks about, in its photo.
@@ -350,14 +363,16 @@ class Work {
 
   // After the first outline of a leaf: where to draw it again.
   offerPartner(pane, leaf) {
-    if (leaf && this.edits.list.filter((edit) => edit.op === "outline" && edit.leaf === leaf).length > 1) return;
+    const isFirst = this.edits.list.filter((edit) => edit.op === "outline" && edit.leaf === leaf).length === 1;
+    this.partner = leaf && isFirst ? { view: this.data.views[pane.view].name, leaf } : null;
+    if (leaf && !isFirst) return;
     const other = this.panes.find((one) => one !== pane);
     const apart = this.data.correct.angles[pane.view][other.view];
     if (apart < PARTNER.least || apart > PARTNER.most) other.show(this.partnerOf(pane.view));
     const degrees = this.data.correct.angles[pane.view][other.view];
-    const how = leaf ? `as "${leaf}"` : "and pick this outline first, or give both one name";
+    const how = leaf ? `as "${leaf}"; the name is in the field already` : "and pick this outline first, or give both one name";
     const { name } = this.data.views[other.view];
-    this.say(`Now the same leaf in photo ${name}, ${degrees}\u00b0 away, ${how}: the other photos follow.`);
+    this.say(`Now the same leaf in photo ${name}, ${degrees}\u00b0 away, ${how}. The other photos follow.`);
   }
 
   // The outline as it was before it was fitted to the leaf.

@@ -13,6 +13,7 @@ const HINTS = {
   split: "Draw a line across the mask, from edge to edge, where the two leaves meet. Esc: not now.",
   word: "Outlines with the same name, in several photos, show the same leaf.",
   learned: "The detector has learned from these leaves. It is kept by the whole result.",
+  near: "no photo shows the leaf from another side, so outline it in as many photos as you can.",
   saved: "Saved where your browser saves files. To have every photo follow: " +
     "mvseg infer SCENE --corrections corrections.json",
 };
@@ -134,20 +135,25 @@ class Panel {
     const { panes, data, tool } = this.work;
     const degrees = data.correct.angles[panes[0].view][panes[1].view];
     if (tool !== "outline" || panes[0].view === panes[1].view) return [];
-    const isGood = degrees >= PARTNER.least && degrees <= PARTNER.most;
-    const advice = isGood ? "good for one leaf in both" : `best are ${PARTNER.least} to ${PARTNER.most}\u00b0`;
     const other = this.work.partnerOf(this.work.active.view);
+    const most = data.correct.angles[this.work.active.view][other];
+    const isGood = degrees >= Math.min(PARTNER.least, most) && degrees <= PARTNER.most;
+    const advice = most < PARTNER.least ? HINTS.near : isGood ? "good for one leaf in both."
+      : `best are ${PARTNER.least} to ${PARTNER.most}\u00b0.`;
     const show = this.button(`Show ${data.views[other].name} beside it`, null, () => {
       panes.find((pane) => pane !== this.work.active).show(other);
       this.work.changed();
     });
-    return [element("p", { class: "note" }, `These photos are ${degrees}\u00b0 apart: ${advice}.`), ...(isGood ? [] : [show])];
+    return [element("p", { class: "note" }, `These photos are ${degrees}\u00b0 apart: ${advice}`), ...(isGood ? [] : [show])];
   }
 
   draftTools() {
     const { work } = this;
     const others = work.picks.filter((pick) => pick.view !== work.draft.pane.view);
     const names = others.map((pick) => work.data.views[pick.view].name).join(", ");
+    if (!others.length && work.draft !== this.draft) {
+      [this.draft, this.word.value] = [work.draft, work.nameOf(work.draft.pane.view)];
+    }
     const same = others.length
       ? [element("p", {}, `It shows the same leaf as what is picked in ${names}.`)]
       : [element("label", {}, "Its leaf: ", this.word), element("p", { class: "note" }, HINTS.word)];
@@ -159,9 +165,7 @@ class Panel {
   }
 
   keep() {
-    const leaf = this.word.value.trim();
-    this.word.value = ""; // the next outline may show another leaf
-    this.work.keep(leaf);
+    this.work.keep(this.word.isConnected ? this.word.value.trim() : "");
   }
 
   list() {
@@ -186,6 +190,7 @@ class Panel {
     const { server } = this.work;
     if (!server?.learning) return [];
     const { now, isLearned, seconds } = server.learning;
+    this.parts.learn.classList.toggle("news", Boolean(now || server.lesson)); // then it stands on top
     const title = element("h2", {}, "A plant that the detector does not know");
     if (now) {
       this.showProgress();
@@ -195,7 +200,8 @@ class Panel {
     const cost = "The detector learns the leaves that the photos agree about, and your outlines, and looks again. " +
       `About ${count(Math.ceil(seconds / 60), "minute")} for ${count(this.work.data.views.length, "photo")} on two ` +
       "processor cores; your edits stay, and it can be undone.";
-    return [title, element("p", { class: "note" }, isLearned ? HINTS.learned : cost),
+    return [title, ...(server.lesson ? [element("p", {}, server.lesson)] : []),
+      element("p", { class: "note" }, isLearned ? HINTS.learned : cost),
       element("div", { class: "answers" }, this.action("learn", "Learn from these leaves"),
         ...(isLearned ? [this.button("Undo learning", null, () => server.learn("unlearn"))] : []))];
   }

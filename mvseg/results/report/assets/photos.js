@@ -6,9 +6,10 @@ function buildPhotos(data, addresses, lookThrough) {
   const tiles = document.getElementById("tiles");
   const colors = new Map(data.leaves.map((leaf) => [leaf.id, leaf.color]));
   const marks = new Map(data.leaves.map((leaf) => [leaf.id, []]));
+  const names = shortNames(data.views.map(({ name }) => name));
   const figures = data.views.map((view, index) => {
     const picture = drawView(view, addresses.pictures[index], colors, marks);
-    const figure = makeFigure(view, index, picture, lookThrough);
+    const figure = makeFigure({ ...view, short: names[index] }, index, picture, lookThrough);
     figure.dataset.view = index;
     tiles.append(figure);
     return figure;
@@ -36,7 +37,7 @@ function showsLeaf(view, leaf) {
 }
 
 function makeFigure(view, index, picture, lookThrough) {
-  const name = element("span", { title: view.name }, view.name);
+  const name = element("span", { title: view.name }, view.short);
   const look = element("button", {
     type: "button", title: "leaves in 3D over this photo, from its camera",
     "aria-label": `leaves in 3D over photo ${view.name}`,

@@ -11,9 +11,13 @@ function inSymbols(text) {
   return text.replaceAll(" +- ", " \u00b1 ").replace(/\^2\b/g, "\u00b2");
 }
 
-function buildCard(card) {
+// `mvseg correct` serves the page that a command would open, and may have replaced another result.
+function buildCard(card, { traits, correct: { isServed } }) {
   const place = document.getElementById("card");
-  const lines = card ? [["found", card.found], ["in doubt", card.doubt], ["next", card.next_step]] : [];
+  const isStale = isServed && !traits.length && card?.found?.includes("area");
+  const next = isServed ? card?.next_step?.replace(/: mvseg correct .*/, ": \u201cCorrect\u201d, above") : card?.next_step;
+  const lines = card ? [["before", card.before], [isStale ? "found before your edits" : "found", card.found],
+    ["in doubt", card.doubt], ["next", next]] : [];
   const terms = lines.filter(([, text]) => text)
     .flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, inSymbols(text))]);
   if (terms.length) place.append(element("dl", {}, ...terms));
@@ -29,11 +33,12 @@ function buildRun(data) {
   link.textContent = count(warnings.length, "warning");
   link.hidden = warnings.length === 0;
 
-  buildCard(run.card);
+  buildCard(run.card, data);
 
   const list = findings.length
     ? element("ul", {}, ...findings.map(({ level, topic, sentence }) => element("li", {}, `${level}, ${topic}: ${sentence}`)))
-    : element("p", { class: "note" }, "There were none.");
+    : element("p", { class: "note" }, `There were none.${data.correct.doubts.length
+      ? ` ${count(data.correct.doubts.length, "question")} about single masks and leaves can be answered (\u201cCorrect\u201d).` : ""}`);
   const facts = [
     ["mvseg", run.mvseg], ["Python", run.python], ["PyTorch", run.torch],
     ["masks", run.mask_kind ?? "found by a detector"], ["matched by", run.matched_by],
@@ -44,7 +49,7 @@ function buildRun(data) {
   const terms = facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]);
   document.getElementById("run").append(
     element("div", { id: "findings" }, element("h2", {}, "Findings"), list),
-    element("div", {}, element("h2", {}, "Run"), element("dl", {}, ...terms)),
+    element("details", {}, element("summary", {}, "Run"), element("dl", {}, ...terms)),
     element("details", {}, element("summary", {}, "Options"), element("pre", {}, run.config)),
   );
 }

@@ -44,6 +44,16 @@ const shownView = {
   },
 };
 
+// Names of photos as far as they differ, for places where little of them fits: "frame-000123" is frame 123.
+function shortNames(names) {
+  if (names.every((name) => /^frame-\d+$/.test(name))) return names.map((name) => `frame ${Number(name.slice(6))}`);
+  const [first] = names;
+  const isStart = (start) => /[^a-z0-9]$/i.test(start) && names.every((name) => name.startsWith(start));
+  let same = names.length > 1 && first.length > 10 ? first.length : 0;
+  while (same && !isStart(first.slice(0, same))) same -= 1;
+  return names.map((name) => (same ? `\u2026${name.slice(same)}` : name));
+}
+
 const SVG = "http://www.w3.org/2000/svg";
 
 // An element with attributes and children. Text becomes a text node: it is never read as HTML.

@@ -16,11 +16,14 @@ class Server {
     this.base = work.data.correct.revision; // name of the edits that are saved, as far as this page knows
     this.own = new Set([this.base]); // names of all lists that it started from or saved
     this.learning = null; // {now: what is done, "" for nothing; isLearned, seconds}; null: nothing can learn
+    this.before = null; // ids of the leaves before the detector learned, until the outcome is there
+    this.lesson = ""; // that outcome, until the next edit
     this.isLost = false; // it does not answer
     this.isStale = false; // another page has changed the edits: this one must not save over them
     work.edits.listen(() => {
       [this.unsaved, this.isComputing] = [true, true];
       Object.assign(this.messages, { fit: "", whole: "", learning: "" }); // of what was done before
+      this.lesson = "";
       for (const pane of work.panes) pane.draw();
       this.send();
     });
@@ -95,6 +98,7 @@ class Server {
     const isOld = revision !== this.base; // it was on its way while newer edits were saved
     const isStep = !isFirst && this.isComputing && doing && !update;
     Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved || isOld });
+    if (isFirst && learning?.now) this.before = this.work.data.leaves.map(({ id }) => id);
     if (making && !update) return this.tell({}, `Making the whole result: ${making}`);
     if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
     if (isStep && this.work.panel) return this.work.panel.showStep(doing);
@@ -102,9 +106,25 @@ class Server {
       this.isNewer ||= !isFirst;
       this.work.update(update);
     }
+    if (this.before && !learning.now && (update || !isComputing)) {
+      if (learning.isLearned && update) this.lesson = this.compare(this.before, update);
+      this.before = null;
+    }
     const done = update?.told?.join(" ") || (update || !problem ? "What you see follows from all edits." : "");
     const later = learning?.now ? "Edits are saved, and computed when the detector has learned." : "";
     this.tell({ state: problem }, later || (isComputing ? `Computing${doing ? `: ${doing}` : " what follows from the edits"}\u2026` : done));
+  }
+
+  // What learning has changed, in words.
+  compare(before, { leaves, agreedArea: [first, ...later] }) {
+    const ids = leaves.map(({ id }) => id);
+    const name = (list) => `${list.length === 1 ? "leaf" : "leaves"} ${list.join(", ")}`;
+    const [gone, added] = [before.filter((id) => !ids.includes(id)), ids.filter((id) => !before.includes(id))];
+    const share = Math.round(100 * (later.at(-1) / first - 1));
+    const agree = !later.length || !first ? "" : share === 0 ? "The views agree about as much leaf area as before."
+      : `The views agree about ${Math.abs(share)} % ${share > 0 ? "more" : "less"} leaf area than before.`;
+    return [`${count(before.length, "leaf", "leaves")} before, ${ids.length} now.`, gone.length && `Gone: ${name(gone)}.`,
+      added.length && `New: ${name(added)}.`, agree].filter(Boolean).join(" ");
   }
 
   // A rough outline becomes that of the leaf inside it.
@@ -127,9 +147,12 @@ class Server {
 
   // The whole result, traits included, with the edits that are saved.
   async whole() {
-    this.tell({ whole: "" }, "Making the whole result\u2026");
+    const { folder } = this.work.data.correct; // of tables
+    this.tell({ whole: "" }, folder ? "Writing the tables\u2026" : "Making the whole result\u2026");
     try {
       await this.ask("whole", { method: "POST" });
+      window.sessionStorage.setItem("mvseg-whole", folder ? `The tables and the page were written to ${folder}.` : "");
+      if (this.work.panel) window.history.replaceState(null, "", "#look");
       window.location.reload(); // the page is the new result
     } catch (error) {
       this.tell({ whole: `The whole result was not made: ${error.message}` }, "");
@@ -141,6 +164,8 @@ class Server {
     if (!this.learning || (what === "learn" && this.learning.now)) return;
     try {
       await this.ask(what, { method: "POST" });
+      this.before = what === "learn" ? this.work.data.leaves.map(({ id }) => id) : null;
+      this.lesson = "";
       this.tell({ learning: "" }, this.state);
     } catch (error) {
       this.tell({ learning: error.message }, this.state);

@@ -14,6 +14,21 @@ function makeLeaf(leaf, { points, faces }) {
   return { id: leaf.id, mesh, middle: middleOf(positions) };
 }
 
+// "rgb(...)", the mean colour of a leaf in the photos; null where it was not measured.
+function photoColor({ traits }) {
+  const parts = ["mean_red", "mean_green", "mean_blue"].map((name) => traits?.[name]?.value);
+  return parts.every(Number.isFinite) ? `rgb(${parts.map((part) => Math.round(255 * part)).join(", ")})` : null;
+}
+
+// A node is an octahedron in the colour of its leaf.
+function makeNode({ at }, leaf) {
+  const ends = [0, 1, 2].flatMap((axis) => [1, -1].map((side) => [0, 1, 2].map((n) => (n === axis ? side * 0.025 : 0))));
+  const points = ends.map((end) => new THREE.Vector3(...at).add(new THREE.Vector3(...end)));
+  const geometry = new THREE.BufferGeometry().setFromPoints(points);
+  geometry.setIndex([0, 2, 4, 2, 1, 4, 1, 3, 4, 3, 0, 4, 2, 0, 5, 1, 2, 5, 3, 1, 5, 0, 3, 5]);
+  return new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ color: leaf?.color ?? "#969696" }));
+}
+
 // The vertex nearest to the mean of all: a number there lies on the leaf, however it is bent.
 function middleOf(positions) {
   const points = [];
@@ -54,6 +69,27 @@ function loadTexture(address, draw) {
   const texture = new THREE.TextureLoader().load(address, draw);
   texture.colorSpace = THREE.SRGBColorSpace;
   return texture;
+}
+
+// Paint the masks of a view over its photo: `box` is the part of the photo that they are drawn on. null: the photo alone.
+function paintTexture(texture, masks) {
+  if (!texture?.image) return; // not loaded yet
+  const photo = (texture.userData.photo ??= texture.image);
+  texture.image = photo;
+  if (masks) {
+    const { view, box: [x1, y1, x2], colors } = masks;
+    texture.image = element("canvas", { width: photo.width, height: photo.height });
+    const pen = texture.image.getContext("2d");
+    const scale = ((x2 - x1) * photo.width) / UNITS;
+    pen.drawImage(photo, 0, 0);
+    pen.setTransform(scale, 0, 0, scale, x1 * photo.width, y1 * photo.height);
+    pen.globalAlpha = 0.55;
+    for (const mask of view.masks.filter(({ leaf }) => leaf > 0)) {
+      pen.fillStyle = colors.get(mask.leaf);
+      pen.fill(new Path2D(mask.path), "evenodd");
+    }
+  }
+  texture.needsUpdate = true;
 }
 
 function makeGrid(space) {

@@ -3,6 +3,8 @@
 const FIELD = 35; // degrees
 const FADED = 0.16; // opacity of leaves that are not selected
 const OVER_PHOTO = 0.55; // of all leaves, before a photo
+const LAYERS = { leaves: true, stems: true, nodes: false, photos: true, masks: false, numbers: true, grid: true };
+const LONGEST_BAR = 120; // pixels of the scale bar
 
 class Space {
   constructor(data, addresses, renderer) {
@@ -17,15 +19,20 @@ class Space {
     const withShape = data.leaves.filter((leaf) => leaf.id in data.space.leaves);
     this.leaves = withShape.map((leaf) => makeLeaf(leaf, data.space.leaves[leaf.id]));
     const share = 2 / data.views.length;
-    const textures = addresses.thumbnails.map((address) => loadTexture(address, () => this.draw()));
+    const textures = addresses.thumbnails.map((address) => loadTexture(address, () => this.paintMasks()));
     this.cameras = data.space.cameras.map((entry, view) =>
       makeCamera(entry, data.views[view], { view, share, texture: textures[view] }));
     this.ground = makeGrid(data.space);
     this.backdrop = makeBackdrop();
+    this.groups = {
+      leaves: this.leaves.map((leaf) => leaf.mesh), stems: data.space.stems.map(makeStem),
+      nodes: data.space.nodes.map((node) => makeNode(node, data.leaves.find((leaf) => leaf.id === node.leaf))),
+    };
     this.scene = new THREE.Scene().add(
       makeSky(), this.camera.add(makeLamp()), this.ground, this.backdrop,
-      ...this.leaves.map((leaf) => leaf.mesh), ...data.space.stems.map(makeStem), ...this.cameras.map((one) => one.group));
+      ...Object.values(this.groups).flat(), ...this.cameras.map((one) => one.group));
     this.labels = makeLabels(this.leaves);
+    this.layers = makeLayers(data, () => this.showLayers());
   }
 
   listen() {
@@ -37,12 +44,12 @@ class Space {
     selection.listen(() => this.mark());
     listenToPointer(this);
     const on = (name, event, change) => document.getElementById(name).addEventListener(event, change);
-    on("show-cameras", "change", () => this.showBackdrop(this.shown));
-    on("show-numbers", "change", (event) => {
-      document.getElementById("space-labels").hidden = !event.target.checked;
-    });
+    document.getElementById("space-save").append(...exportButtons(() => `${this.data.plant}_3d`, () => this.figure()));
+    on("leaf-colors", "change", () => this.color());
     on("look-plant", "click", () => this.lookAround(this.plant()));
     on("look-all", "click", () => this.lookAround(this.everything()));
+    this.color();
+    this.showLayers();
     this.resize();
     this.lookAround(this.leaves.length ? this.plant() : this.everything());
   }
@@ -57,8 +64,43 @@ class Space {
     });
   }
 
+  // Leaves in the mean colours of their pixels in the photos, or in those that tell them apart.
+  color() {
+    const choice = document.getElementById("leaf-colors");
+    const colors = this.data.leaves.map(photoColor);
+    choice.hidden = !colors.some(Boolean);
+    const isByLeaf = choice.hidden || choice.value === "leaf";
+    for (const { id, mesh: { material } } of this.leaves) {
+      const at = this.data.leaves.findIndex((leaf) => leaf.id === id);
+      for (const color of [material.color, material.emissive]) {
+        color.set(isByLeaf ? this.data.leaves[at].color : colors[at] ?? "#969696");
+      }
+    }
+    this.draw();
+  }
+
+  showLayers() {
+    const { leaves, stems, nodes, numbers } = this.layers;
+    for (const [name, box] of Object.entries({ leaves, stems, nodes })) {
+      for (const mesh of this.groups[name]) mesh.visible = box.checked;
+    }
+    document.getElementById("space-labels").hidden = !numbers.checked;
+    this.paintMasks();
+    this.showBackdrop(this.shown);
+  }
+
+  // Masks over the photos of the cameras, and over the one behind the leaves.
+  paintMasks() {
+    const colors = new Map(this.data.leaves.map((leaf) => [leaf.id, leaf.color]));
+    const paint = (texture, view, box) => paintTexture(texture, this.layers.masks.checked ? { view, box, colors } : null);
+    this.cameras.forEach((one, n) => paint(one.photo.material.map, this.data.views[n], this.data.views[n].box));
+    if (this.shown !== null) paint(this.backdrop.material.map, this.data.views[this.shown], [0, 0, 1, 1]);
+    this.draw();
+  }
+
   drawNow() {
     this.renderer.render(this.scene, this.camera);
+    this.drawScale();
     for (const { leaf, text } of this.labels) {
       const { x, y, isAhead } = this.positionOf(leaf.id);
       text.style.visibility = isAhead ? "visible" : "hidden";
@@ -69,6 +111,40 @@ class Space {
     }
   }
 
+  // A length at the middle of the view.
+  drawScale() {
+    const { camera, canvas, data } = this;
+    const depth = -this.controls.target.clone().applyMatrix4(camera.matrixWorldInverse).z;
+    const px = (camera.projectionMatrix.elements[5] * canvas.clientHeight) / 2 / depth / data.space.radius;
+    const power = 10 ** Math.floor(Math.log10(LONGEST_BAR / px));
+    const length = [5, 2, 1].find((step) => step * power * px <= LONGEST_BAR) * power;
+    this.bar = { width: length * px, text: `${Number(length.toPrecision(6))} ${data.unit}` };
+    const [text, line] = document.getElementById("space-scale").children;
+    text.textContent = this.bar.text;
+    line.style.width = `${this.bar.width.toFixed(1)}px`;
+  }
+
+  // What is shown, as an SVG: a picture of the leaves; numbers and the scale bar are text.
+  figure() {
+    const { renderer, canvas, bar } = this;
+    const { clientWidth: width, clientHeight: height } = canvas;
+    const ratio = renderer.getPixelRatio();
+    renderer.setPixelRatio(LARGER);
+    this.drawNow();
+    const image = drawing("image", { href: canvas.toDataURL("image/png"), width, height });
+    renderer.setPixelRatio(ratio);
+    this.drawNow();
+    const write = (x, y, text) => drawing("text", {
+      x, y, "font-size": 12, "font-weight": 600, "text-anchor": "middle", fill: PAPER.ink, stroke: PAPER.back,
+      "stroke-width": 2.5, "paint-order": "stroke",
+    }, text);
+    const numbers = this.layers.numbers.checked ? this.labels.map(({ leaf }) => [leaf.id, this.positionOf(leaf.id)]) : [];
+    return drawing("svg", { viewBox: `0 0 ${width} ${height}` }, image,
+      ...numbers.filter(([, { isAhead }]) => isAhead).map(([id, { x, y }]) => write(x, y + 4, id)),
+      drawing("path", { d: `M${width - 16 - bar.width} ${height - 16}h${bar.width}`, stroke: PAPER.ink, "stroke-width": 3 }),
+      write(width - 16 - bar.width / 2, height - 24, bar.text));
+  }
+
   resize() {
     const { clientWidth, clientHeight } = this.canvas;
     if (clientWidth === 0 || clientHeight === 0) return;
@@ -77,6 +153,7 @@ class Space {
     this.camera.aspect = clientWidth / clientHeight;
     if (this.shown !== null) this.lookThrough(this.shown);
     else this.camera.updateProjectionMatrix();
+    this.drawNow(); // at once: paper does not wait for the next frame
     this.draw();
   }
 
@@ -136,7 +213,7 @@ class Space {
     const { camera } = this;
     const { center, up, ahead, rays } = this.cameras[view];
     const corners = hangBackdrop(this.backdrop, center, cropOf(rays, this.data.views[view].box));
-    if (view !== this.shown) setTexture(this.backdrop, loadTexture(this.addresses.pictures[view], () => this.draw()));
+    if (view !== this.shown) setTexture(this.backdrop, loadTexture(this.addresses.pictures[view], () => this.paintMasks()));
     camera.position.copy(center);
     camera.up.copy(up);
     camera.lookAt(ahead.clone().add(center));
@@ -155,9 +232,8 @@ class Space {
   showBackdrop(view) {
     this.shown = view;
     this.backdrop.visible = view !== null;
-    this.ground.visible = view === null;
-    const areCamerasOn = document.getElementById("show-cameras").checked;
-    for (const one of this.cameras) one.group.visible = view === null && areCamerasOn;
+    this.ground.visible = view === null && this.layers.grid.checked;
+    for (const one of this.cameras) one.group.visible = view === null && this.layers.photos.checked;
     const note = document.getElementById("space-note");
     note.textContent = view === null ? describeSpace(this.data)
       : `From the camera of photo ${this.data.views[view].name}, with the photo behind the leaves.`;
@@ -181,8 +257,8 @@ function buildSpace(data, addresses) {
 
 function describeSpace(data) {
   const squares = `Squares on the ground: ${Number(data.space.grid.toPrecision(6))} ${data.unit}.`;
-  const ofStem = data.space.upFrom === "stem" ? " Heights and angles are along the stem." : "";
-  const up = data.space.isUpKnown ? "" : ` Which way is up is not known; most photos have their upper side up.${ofStem}`;
+  const how = data.space.upFrom === "stem" ? "are along the stem" : "are not measured";
+  const up = data.space.isUpKnown ? "" : ` Up is unknown (--up): heights and angles ${how}.`;
   const hasLeaves = Object.keys(data.space.leaves).length > 0;
   return (hasLeaves ? "" : "Cameras only: there are no shapes in 3D. ") + squares + up;
 }
@@ -195,6 +271,18 @@ function makeLabels(leaves) {
   });
 }
 
+// {layer: its checkbox}, for the layers that there are.
+function makeLayers({ leaves, space }, change) {
+  const isEmpty = { leaves: !leaves.length, stems: !space.stems.length, nodes: !space.nodes.length };
+  return Object.fromEntries(Object.entries(LAYERS).map(([name, isShown]) => {
+    const box = element("input", { type: "checkbox" });
+    box.checked = isShown;
+    box.addEventListener("change", change);
+    document.getElementById("space-layers").append(element("label", { hidden: isEmpty[name] ? "" : null }, box, name));
+    return [name, box];
+  }));
+}
+
 // What the pointer is on: a leaf, or the photo of a camera.
 function listenToPointer({ canvas, camera, leaves, cameras }) {
   const caster = new THREE.Raycaster();
@@ -205,7 +293,7 @@ function listenToPointer({ canvas, camera, leaves, cameras }) {
     const { left, top, width, height } = canvas.getBoundingClientRect();
     const at = new THREE.Vector2(((event.clientX - left) / width) * 2 - 1, 1 - ((event.clientY - top) / height) * 2);
     caster.setFromCamera(at, camera);
-    const seen = meshes.filter((mesh) => mesh.parent.visible);
+    const seen = meshes.filter((mesh) => mesh.visible && mesh.parent.visible);
     return caster.intersectObjects(seen, false)[0]?.object.userData ?? {};
   }
 

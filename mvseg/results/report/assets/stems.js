@@ -3,20 +3,24 @@
 function makeStem(part) {
   const { mesh } = makeLeaf({ id: null, color: part.color }, part);
   mesh.userData = {};
-  mesh.material.opacity = part.leaf === undefined ? 1 : 0.6;
+  mesh.material.opacity = part.isGuessed ? 0.6 : 1;
   return mesh;
 }
 
-function drawStem({ path, leaf }) {
-  return drawing("path", { d: path, class: leaf === undefined ? "stem" : "petiole" });
+function drawStem({ path, leaf, isGuessed }) {
+  const kind = leaf !== undefined ? "petiole" : isGuessed ? "stem guessed" : "stem";
+  return drawing("path", { d: path, class: kind });
 }
 
 function describeStem(stem, data) {
   const angle = stem.name === "spiral" ? ` of ${stem.angle}°` : "";
-  const chance = stem.probability === undefined || stem.name === "unclear" ? "" : ` (probability ${stem.probability.toFixed(2)})`;
-  const note = `Found by ${stem.source}; ${stem.name}${angle}${chance}. Petioles are guessed.`;
+  const chance = stem.probability === null || stem.name === "unclear" ? "" : ` (probability ${stem.probability.toFixed(2)})`;
+  const likely = stem.chance < 0.9 ? `, a guess: its probability is ${stem.chance.toFixed(2)}` : "";
+  const note = `Found by ${stem.source}${likely}; ${stem.name}${angle}${chance}. Petioles are guessed.`;
   const title = `Stem ${stem.number}: height (${data.unit}) against azimuth`;
-  return [element("h3", {}, title), element("p", { class: "note" }, note), drawNodes(stem.nodes, data, title)];
+  const picture = drawNodes(stem.nodes, data, title);
+  const buttons = exportButtons(() => `${data.plant}_stem_${stem.number}`, () => picture);
+  return [element("h3", {}, title), element("p", { class: "note" }, note), picture, element("p", {}, ...buttons)];
 }
 
 function drawNodes(nodes, data, title) {
@@ -25,9 +29,18 @@ function drawNodes(nodes, data, title) {
   const picture = drawing("svg", { class: "nodes", viewBox: "0 0 320 240", role: "img", "aria-label": title });
   const write = (x, y, text) => picture.append(drawing("text", { x, y }, `${text}`));
   for (const azimuth of [0, 90, 180, 270]) write(at({ azimuth, height: 0 })[0], 235, `${azimuth}°`);
-  write(0, 15, Number(highest.toPrecision(3)));
+  picture.append(drawing("path", { d: "M30 20V210H290" }));
+  write(0, 15, `${Number(highest.toPrecision(3))} ${data.unit}`);
+  write(0, 214, "0");
+  const numbers = [...new Set(nodes.map(({ node }) => node))];
+  for (const shared of numbers.map((number) => nodes.filter(({ node }) => node === number))) {
+    const places = shared.map(at).sort(([x], [other]) => x - other);
+    picture.append(drawing("path", { d: `M${places.map((place) => place.join(" ")).join("L")}` }));
+  }
   for (const node of nodes) {
     const [x, y] = at(node);
+    const bar = (190 * node.sd) / highest;
+    picture.append(drawing("path", { d: `M${x} ${y - bar}V${y + bar}` }));
     const { color } = data.leaves.find((leaf) => leaf.id === node.leaf) ?? {};
     const dot = drawing("circle", { cx: x, cy: y, r: 6, fill: color });
     dot.addEventListener("click", () => selection.select(node.leaf));

@@ -1,6 +1,8 @@
 // The table of leaves. A click on a header sorts; missing numbers are last either way. Columns are chosen, and what is
 // shown can be saved as CSV.
 
+const FIRST = ["area", "length", "width", "insertion_height"]; // beside leaf, use and doubts: what most people need
+
 function buildTable(data) {
   const columns = listColumns(data);
   const table = document.getElementById("table");
@@ -139,7 +141,9 @@ function listColumns(data) {
     cell: (one) => element("td", { class: "text" }, doubts(one)),
     kind: "text",
   };
-  return [leaf, use, ...chance, ...measured, score, shape, quality];
+  const first = measured.filter(({ fields: [[name]] }) => FIRST.includes(name));
+  const rest = measured.filter((column) => !first.includes(column));
+  return [leaf, use, ...first, quality, ...chance, ...rest, score, shape];
 }
 
 function leafCell(leaf) {
@@ -172,5 +176,7 @@ function makeHeader(column, sort) {
 function describeTable(data, unmatched) {
   const others = unmatched ? ` ${count(unmatched, "mask")} matched to no leaf.` : "";
   const sd = data.traits.length ? " Numbers are given \u00b1 one standard deviation." : "";
-  return `Click a header to sort.${sd}${others}`;
+  const grey = data.leaves.some((leaf) => leaf.doubts?.length) ? " Grey: a leaf with doubts." : "";
+  const pale = data.leaves.some((leaf) => leaf.probability < 0.9) ? " Paler: less probably a leaf." : "";
+  return `Click a header to sort.${sd}${grey}${pale}${others}`;
 }
