@@ -86,7 +86,7 @@ def served(folder: Path) -> Iterator[CorrectionServer]:
 
 def middle(opened: OpenResult, row: int) -> tuple[str, list[float]]:
     """A view's name and a point inside one of its masks."""
-    regions = opened.saved_result().regions
+    regions = opened.saved_result.regions
     rows, columns = np.nonzero(regions.crop(row).numpy())
     x, y = regions.boxes[row, :2].tolist()
     at = [float(x + columns[len(rows) // 2] + 0.5), float(y + rows[len(rows) // 2] + 0.5)]
@@ -667,7 +667,7 @@ def test_learning_that_is_cancelled_or_fails_changes_nothing(
 def test_a_leaf_that_goes_with_an_edit_of_another_is_named(served: CorrectionServer) -> None:
     """One that the edit names goes without a word, and so does one when edits are undone."""
     opened = served.corrector.opened
-    shown, (view, at) = opened.saved_result(), middle(opened, 0)
+    shown, (view, at) = opened.saved_result, middle(opened, 0)
     edits = parse_corrections({"format": FORMAT, "edits": [{"op": "reject", "view": view, "at": at}]}).edits
     ids = shown.masks.instance_ids
     own = int(ids[0])
@@ -790,7 +790,7 @@ def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:
 
 
 def test_an_outline_is_asked_for_by_the_page(served: CorrectionServer) -> None:
-    regions = served.corrector.opened.saved_result().regions
+    regions = served.corrector.opened.saved_result.regions
     view, _ = middle(served.corrector.opened, 0)
     x1, y1, x2, y2 = (regions.boxes[0] + regions.boxes.new_tensor([-4, -4, 4, 4])).tolist()
     rough = [[x1, y1], [x2, y1], [x2, y2], [x1, y2]]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.checks.target_masks import cut_shapes
 from mvseg.cli import main
 from mvseg.demo import demo_scene
 from mvseg.formats.markers import find_markers, read_grey
@@ -117,10 +116,10 @@ def test_masks_end_where_half_of_the_light_is_ink(
     turn = np.linspace(0, 2 * np.pi, 100)
     outline = np.stack([97 + 55 * np.cos(turn), 104 + 55 * np.sin(turn)], 1)  # a bit beside and smaller: no matter
     cell = np.array([[10.0, 10], [190, 10], [190, 190], [10, 190]])
-    labels = cut_shapes(photo, {7: (cell, outline)})
+    labels = check_target.cut_shapes(photo, {7: (cell, outline)})
     assert np.unique(labels).tolist() == [0, 7]
     assert ((labels == 7) != (share[..., 0] > 0.5)).sum() <= most_wrong  # of 11,304 pixels
-    assert not cut_shapes(photo, {7: (cell, outline + 100)}).any()  # another thing than the shape
+    assert not check_target.cut_shapes(photo, {7: (cell, outline + 100)}).any()  # another thing than the shape
 
 
 @pytest.mark.slow

@@ -48,16 +48,12 @@ def run_batch(
     """From scene folders to result folders `out/NAME` and the tables in `out/tables`. Failures are reported on stderr.
 
     Args:
-        source: a table or a folder of scenes, see `list_scenes`.
-        out: folder of the results; made when missing.
         masks: in each scene folder, or beside them; None: a detector finds them.
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
-        scheduler: of a Dask cluster, see `connect`.
 
-    Raises:
-        InputError: bad input, before any scene is started: the table, `out`, the scheduler.
-        OSError: the folder of the batch cannot be written.
+    Raises InputError: bad input, before any scene is started: the table, `out`, the scheduler; OSError: the folder of
+    the batch cannot be written.
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
@@ -77,12 +73,8 @@ def run_batch(
             run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
             write_tables(place / TABLES, place, rows, run={**run, "config": asdict(config)})
     done = [status for _, status in rows if status.state == "done"]
-    return BatchCounts(
-        done=len(done),
-        resumed=sum(each.is_kept for each in finished.values()),
-        failed=len(rows) - len(done),
-        warned=sum(bool(status.warnings) for status in done),
-    )
+    resumed, warned = sum(each.is_kept for each in finished.values()), sum(bool(each.warnings) for each in done)
+    return BatchCounts(done=len(done), resumed=resumed, failed=len(rows) - len(done), warned=warned)
 
 
 def _find_weights(config: RunConfig) -> RunConfig:

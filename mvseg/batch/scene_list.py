@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 import sys
-from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,7 +29,6 @@ class BatchScene:
         name: of its result folder; unique in the batch, case ignored.
         folder: the scene folder, absolute; it need not exist.
         masks: the path that the table gives, or that of `--masks`; None: a detector finds them.
-        corrections: the path that the table gives to a file of corrections; None: there are none.
         beside: where a relative path of masks or corrections may start, besides the scene folder; absolute.
         carried: {column: text} of the cells copied into all tables: `plant`, `time`, then other columns.
     """
@@ -45,16 +42,13 @@ class BatchScene:
 
 
 def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:
-    """The scenes of a batch, in the order of the table, or of the names of the folders.
+    """The scenes of a batch, in the order of the table, or of the names of the folders; `masks` are of those for which
+    the table names none.
 
-    Args:
-        source: a CSV table with a column `scene`, the path of a scene folder that starts at the table's own folder, and
-            perhaps `name`, `masks`, `corrections`, `plant`, `time` and others; or a folder with one scene in each
-            sub-folder. Hidden sub-folders, and `out`, are none.
-        masks: of the scenes for which the table names none.
-
-    Raises:
-        InputError: there is nothing of that name, the table is broken, there are no scenes, or two of one name.
+    `source` is a CSV table with a column `scene`, the path of a scene folder that starts at the table's own folder, and
+    perhaps `name`, `masks`, `corrections`, `plant`, `time` and others; or a folder with one scene in each sub-folder.
+    Hidden sub-folders, and `out`, are none. Raises InputError: there is nothing of that name, the table is broken,
+    there are no scenes, or two of one name.
     """
     if source.is_dir():
         scenes = _list_folders(source, out, masks)
@@ -88,10 +82,11 @@ def _list_folders(source: Path, out: Path, masks: Path | None) -> tuple[BatchSce
 
 
 def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
+    from mvseg.traits.table import COLUMNS, wide_columns
+
     columns, rows = _read_rows(source)
-    extra = [column for column in columns if column not in (*OWN_COLUMNS, "plant", "time")]
-    taken = sorted(set(extra) & _columns_of_results())
-    if taken:
+    extra = [column for column in columns if column not in KNOWN_COLUMNS]
+    if taken := sorted({*extra} & {*COLUMNS, *wide_columns(), *SUMMARY_COLUMNS} - {"plant"}):
         raise InputError(f"{source}: the column '{taken[0]}' is one of the results' own, expected another name")
     scenes = []
     for line, cells in rows:
@@ -123,35 +118,23 @@ def _beside_table(source: Path, path: str | None) -> Path | None:
 
 
 def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    rows = read_table(source, "a CSV table")
-    if not rows:
+    (_, columns), *rows = read_table(source, "a CSV table") or [(0, [])]
+    if not columns:
         raise InputError(f"{source}: is empty, expected a table with a column 'scene'")
-    (_, columns), *rows = rows
     columns = [column.lower() if column.lower() in KNOWN_COLUMNS else column for column in columns]
-    _check_columns(source, columns)
+    if "scene" not in columns:
+        shown = ", ".join(columns)[:200]
+        raise InputError(f"{source}: has no column 'scene', found {shown}; expected the paths of scene folders there")
+    if "" in columns:
+        raise InputError(f"{source}: a column has no name")
+    if twice := [column for column in columns if columns.count(column) > 1]:
+        raise InputError(f"{source}: two columns are called '{twice[0]}', expected different names")
     if not rows:
         raise InputError(f"{source}: names no scenes, expected one row per scene")
     for line, cells in rows:
         if len(cells) != len(columns):
             raise InputError(f"{source}: line {line} has {len(cells)} cells, expected {len(columns)}")
     return columns, rows
-
-
-def _check_columns(source: Path, columns: Sequence[str]) -> None:
-    if "scene" not in columns:
-        shown = ", ".join(columns)[:200]
-        raise InputError(f"{source}: has no column 'scene', found {shown}; expected the paths of scene folders there")
-    if "" in columns:
-        raise InputError(f"{source}: a column has no name")
-    for column, count in Counter(columns).items():
-        if count > 1:
-            raise InputError(f"{source}: two columns are called '{column}', expected different names")
-
-
-def _columns_of_results() -> set[str]:
-    from mvseg.traits.table import COLUMNS, wide_columns
-
-    return {*COLUMNS, *wide_columns(), *SUMMARY_COLUMNS, "sentence"} - {"plant"}
 
 
 def _name_of(path: str) -> str:

@@ -23,7 +23,6 @@ class Status(BaseModel, frozen=True):
 
     Attributes:
         state: "running" from the moment a process takes the scene until its result is there.
-        scene: the scene folder.
         key: hash of the inputs and the options, see `scene_key`; "" where the inputs could not be read.
         result: SHA-256 of the result's run.json, which lists the hashes of all its files.
         instances, masks, views: how many the result has.

@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mvseg.batch.scene_list import SUMMARY_COLUMNS, BatchScene
-from mvseg.batch.status import TABLES, Status
-from mvseg.errors import InputError
+from mvseg.batch.status import Status
 from mvseg.formats.text_file import Cell, write_table
 from mvseg.results.earlier import Output, replace_result
 from mvseg.traits.table import COLUMNS, read_csv, wide_columns
@@ -22,7 +21,7 @@ def write_tables(
     result cannot be read, or `folder` cannot be replaced (see `replace_result`)."""
     carried = list(scenes[0][0].carried)
     done = [scene for scene, status in scenes if status.state == "done"]
-    summary = [[*_about(scene), *_outcome(status)] for scene, status in scenes]
+    summary = [[scene.name, *scene.carried.values(), *_outcome(status)] for scene, status in scenes]
     failures = [(scene.name, str(scene.folder), status.sentence)
                 for scene, status in scenes if status.state == "failed"]  # fmt: skip
     counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
@@ -31,19 +30,6 @@ def write_tables(
             _join(partial / name, columns, done, out, carried=carried)
         write_table(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)
         write_table(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
-
-
-def read_batch_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
-    """The rows of a table of a finished batch, which has these columns and perhaps others. Raises InputError if `batch`
-    is not the --out of a finished batch, or its table is broken."""
-    path = batch / TABLES / name
-    if not path.is_file():
-        raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/{name} is missing)")
-    return read_csv(path, columns)
-
-
-def _about(scene: BatchScene) -> tuple[Cell, ...]:
-    return scene.name, *scene.carried.values()
 
 
 def _outcome(status: Status) -> tuple[Cell, ...]:
@@ -58,7 +44,7 @@ def _join(
 ) -> None:
     shared = [column for column in columns if column not in carried]
     rows = [
-        [*_about(scene), *(row[column] for column in shared)]
+        [scene.name, *scene.carried.values(), *(row[column] for column in shared)]
         for scene in scenes
         for row in read_csv(out / scene.name / path.name, columns)
     ]

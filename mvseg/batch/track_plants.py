@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mvseg._version import made_by
-from mvseg.batch.tables import read_batch_table
+from mvseg.batch.status import TABLES
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import Edit, load_corrections
 from mvseg.errors import InputError
@@ -22,9 +22,10 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.numbers import PAGE
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
-from mvseg.tracking.recorded import PlantResults, find_plant_links, record_plants
+from mvseg.tracking.recorded import PlantResults, find_plant_links
 from mvseg.tracking.tables import join_tables, write_track_tables
 from mvseg.tracking.track import track_leaves
+from mvseg.traits.table import read_csv
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,17 @@ class TrackedPlant:
 
 def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer. Raises
-    InputError as `read_batch_table`, or if no plant has two dates."""
+    InputError if `batch` is not the --out of a finished batch, its table is broken, or no plant has two dates."""
     scenes: dict[str, list[tuple[str, str]]] = {}
-    for row in read_batch_table(batch, "summary.csv", ("scene", "plant", "time", "state")):
+    path = batch / TABLES / "summary.csv"
+    if not path.is_file():
+        raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/summary.csv is missing)")
+    for row in read_csv(path, ("scene", "plant", "time", "state")):
         if row["state"] == "done":
             scenes.setdefault(row["plant"], []).append((row["scene"], row["time"]))
-    plants = [
-        PlantResults(plant, tuple(batch / scene for scene, _ in seen), tuple(time for _, time in seen))
-        for plant, seen in scenes.items()
-        if len(seen) > 1
-    ]
+    dated = {plant: list(zip(*of, strict=True)) for plant, of in scenes.items() if len(of) > 1}
+    plants = [PlantResults(plant=plant, results=tuple(map(batch.joinpath, names)), times=times)
+              for plant, (names, times) in dated.items()]  # fmt: skip
     if not plants:
         message = "no plant has two finished dates, expected a table with columns plant and time (docs/batch.md)"
         raise InputError(f"{batch}: {message}")
@@ -72,28 +74,31 @@ def track_plants(
     Args:
         out: the tables of `write_track_tables`, tracks.html and run.json; of several plants, the pages lie in
             `plants/`, and tracks.html is their list.
-        corrections: a file with `same_track` and `different_track`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
 
-    Raises:
-        InputError: `out` cannot be written, or holds something else or tracks of other results; the corrections are
-            broken, or every plant failed.
+    Raises InputError: `out` cannot be written, or holds something else or tracks of other results; the corrections are
+    broken, or every plant failed.
     """
-    if num_workers < 1:
-        raise InputError(f"num_workers is {num_workers}, expected at least 1")
     edits = () if corrections is None else load_corrections(corrections).edits
     record: dict[str, Any] = {}
-    folders = tuple(folder for plant in plants for folder in plant.folders)
+    folders = tuple(folder for plant in plants for folder in plant.results)
     output = Output("tracks", of=folders, reads=() if corrections is None else (corrections,))
     with replace_result(out, record, output) as folder:
         places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
         places = places if len(plants) > 1 else [folder]
         work = partial(_track_plant, edits, pots=pots, report=report)
         items = dict(enumerate(zip(plants, places, strict=True)))
-        with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
-            bar = progress_bar(answers, total=len(plants), name="track", unit="plant")
-            done = {index: _or_failed(answer, plants[index]) for index, answer in bar}
+        num_workers = min(num_workers, len(items))
+        opened: AbstractContextManager[Engine] = open_workers(work, num_workers, scheduler)
+        if scheduler is None and num_workers == 1:
+            opened = nullcontext(lambda items, _: ((index, work(item)) for index, item in items.items()))
+        with opened as engine, closing(engine(items, int)) as answers:
+            done = dict(progress_bar(answers, total=len(plants), name="track", unit="plant"))
+        for index, answer in done.items():
+            if isinstance(answer, Lost):
+                sentence = f"{plants[index].plant}: the process that worked on it {answer.reason}"
+                done[index] = TrackedPlant(sentence=sentence)
         tracked = [done[index] for index in items]
         if all(plant.sentence for plant in tracked):
             raise InputError(tracked[0].sentence)
@@ -106,21 +111,6 @@ def track_plants(
                 shutil.rmtree(folder / "plants")
         record |= _describe_run(plants, tracked, corrections, pots)
     return tracked
-
-
-@contextmanager
-def _open(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    if scheduler is None and num_workers == 1:
-        yield lambda items, _: ((index, work(item)) for index, item in items.items())
-    else:
-        with open_workers(work, num_workers, scheduler) as engine:
-            yield engine
-
-
-def _or_failed(answer: TrackedPlant | Lost, plant: PlantResults) -> TrackedPlant:
-    if isinstance(answer, Lost):
-        return TrackedPlant(sentence=f"{plant.plant}: the process that worked on it {answer.reason}")
-    return answer
 
 
 def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots: Pots, report: bool) -> TrackedPlant:
@@ -144,14 +134,14 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
 def _describe_run(
     plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], corrections: Path | None, pots: Pots
 ) -> dict[str, Any]:
-    inputs = [place / RUN_FILE for plant in plants for place in plant.folders]  # which list the hashes of all files
+    inputs = [place / RUN_FILE for plant in plants for place in plant.results]  # which list the hashes of all files
     if corrections is not None:
         inputs.append(corrections)
     return {
         **made_by(),
         "inputs": {str(path): hash_files(path) if path.is_file() else None for path in inputs},
         "config": {"corrections": None if corrections is None else str(corrections.resolve()), "pots": pots,
-                   "plants": record_plants(plants)},
+                   "plants": [{**dict(each), "results": [path.resolve() for path in each.results]} for each in plants]},
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
         "counts": {"plants": len(plants), "dates": sum(plant.dates for plant in tracked),

@@ -1,23 +1,32 @@
-"""Work on one scene of a batch: its result is made unless it exists; a failure becomes a sentence in its status."""
+"""Work on one scene of a batch: its result is made unless it exists; a failure becomes a sentence in its status.
+
+One hash is the key of all that a result depends on: a result with the same key need not be made again.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
 import threading
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
-from mvseg.batch.scene_key import scene_key
+from mvseg._version import code_hash
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, collect_warnings, say_fault
+from mvseg.formats.masks.yolo import name_files
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, Output, check_out
 from mvseg.results.run_record import load_run
 from mvseg.runs.one_scene import save_scene, solve_scene
 from mvseg.runs.request import RunRequest
+from mvseg.scene import Scene
 from mvseg.system.atomic import lock_folder, sweep_abandoned
 from mvseg.system.file_hash import hash_files
 from mvseg.system.threads import stay_on_one_thread
@@ -70,16 +79,16 @@ def _finish(request: RunRequest, *, cache: Path) -> Status:
     # the name in the batch says whose the result is: scenes may have moved
     output = Output("result", reads=(request.scene, *request.inputs))
     check_out(request.out, output)
-    solved = solve_scene(request, cache=cache)
-    save_scene(solved, request, output)
+    result, card = solve_scene(request, cache=cache)
+    save_scene(result, card, request=request, output=output)
     return Status(
         state="done",
         scene=str(request.scene),
         result=hash_files(request.out / RUN_FILE),
-        instances=solved.result.matching.num_instances,
-        masks=len(solved.result.regions),
-        views=len(solved.result.scene.views),
-        warnings=[str(each) for each in solved.result.findings if each.level != "note"],
+        instances=result.matching.num_instances,
+        masks=len(result.regions),
+        views=len(result.scene.views),
+        warnings=[str(each) for each in result.findings if each.level != "note"],
     )
 
 
@@ -104,3 +113,47 @@ def _peak_mb() -> float | None:
         return round(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3, 1)  # kB
     except (OSError, ValueError, StopIteration):
         return None
+
+
+def scene_key(scene: Scene, request: RunRequest) -> str:
+    """The hash of a scene's inputs and of the options of a request.
+
+    It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
+    reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
+    files. Hidden files are ignored. Raises InputError if a file cannot be read, or the weights are not there.
+    """
+    options, masks = asdict(request.config), request.masks
+    try:
+        if masks is None:
+            from mvseg.detectors.zoo import weights_path  # loads torchvision
+
+            options["detect"]["weights"] = None  # their hash counts, not their name
+            others: Any = hash_files(Path(weights_path(request.config.detect.weights)))
+        else:
+            del options["detect"]
+            others = [_describe_file(path, masks) for path in _mask_files(masks)]
+        edits = None if request.corrections is None else hash_files(request.corrections)
+        photos = [_describe_file(view.path, view.path.parent) for view in scene.views if view.path.is_file()]
+    except OSError as error:
+        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
+    told = [code_hash(), _describe_scene(scene), photos, others, edits, options]
+    return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()
+
+
+def _describe_scene(scene: Scene) -> list[Any]:
+    cameras, of_views = scene.cameras, [view.lens for view in scene.views]
+    lenses = [None if each is None else [each.model_name, each.width, each.height, *each.params] for each in of_views]
+    numbers = [tensor.tolist() for tensor in (cameras.K, cameras.R, cameras.t, cameras.sizes)]
+    return [scene.name, scene.unit, scene.up, [view.name for view in scene.views], lenses, numbers]
+
+
+def _describe_file(path: Path, start: Path) -> list[str | int]:
+    about = path.stat()
+    return [Path(os.path.relpath(path, start)).as_posix(), about.st_size, about.st_mtime_ns]
+
+
+def _mask_files(masks: Path) -> list[Path]:
+    if not masks.is_dir():
+        return [masks]
+    files = sorted(path for path in masks.rglob("*") if path.is_file() and not path.name.startswith("."))
+    return files + [path for path in name_files(masks) if path.is_file() and path.parent != masks]

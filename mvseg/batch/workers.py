@@ -61,12 +61,8 @@ def run_locally(
     """The answers of `work` in the order in which they come, each with the key of its item.
 
     At most `num_workers`, >= 1, are spawned; they use one thread, and end with this process, however that ends. When
-    the iterator is closed early, they are stopped at once.
-
-    Args:
-        work: what a module holds, or `partial` of it.
-        items: items that can be pickled, by key.
-        started: called with the key of an item when a worker takes it.
+    the iterator is closed early, they are stopped at once. `work` is a function of a module, or `partial` of it;
+    `items`, by key, can be pickled; `started` is called with the key of an item when a worker takes it.
     """
     with start_workers(num_workers) as workers:
         for key, future in run_each(partial(_work_alone, work), items.items(), workers, started=started):

@@ -61,9 +61,11 @@ def find_coverage(cameras: Cameras) -> Coverage:
 
 
 def camera_findings(scene: Scene, coverage: Coverage) -> list[Finding]:
-    """The findings about the cameras of a scene."""
     cameras, names = scene.cameras, tuple(view.name for view in scene.views)
-    rules = [*_place_rules(cameras, coverage), *_lens_rules(cameras), *_world_rules(scene)]
+    rules = [*_place_rules(cameras, coverage), *_lens_rules(cameras)]
+    world = {"unknown_unit": not scene.unit, "unknown_up": scene.up is None, "upside_down": scene.seems_upside_down}
+    for code in (code for code, is_so in world.items() if is_so):
+        rules.append((code, "warning" if code == "upside_down" else "note", None, {}))
     return list_findings(rules, names)
 
 
@@ -117,15 +119,6 @@ def _lens_rules(cameras: Cameras) -> list[Rule]:
          {name: float(value[is_odd].max(initial=0)), "least": least, "most": most})
         for code, is_odd, name, value in rules
     ]  # fmt: skip
-
-
-def _world_rules(scene: Scene) -> list[Rule]:
-    rules: list[Rule] = [] if scene.unit else [("unknown_unit", "note", None, {})]
-    if scene.up is None:
-        rules.append(("unknown_up", "note", None, {}))
-    elif scene.seems_upside_down:
-        rules.append(("upside_down", "warning", None, {}))
-    return rules
 
 
 def field_of_view(cameras: Cameras) -> Floats:

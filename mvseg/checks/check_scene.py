@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
 from mvseg.checks.groups import group_findings
-from mvseg.checks.masks import detected_findings, mask_findings
+from mvseg.checks.masks import mask_findings
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
 from mvseg.checks.turned_masks import low_fit_findings
@@ -24,10 +24,7 @@ class Check:
     """Outcome of the checks of a scene.
 
     Attributes:
-        regions: its masks, None without any.
         findings: the gravest first; empty for a sound scene that says its unit and up.
-        coverage: what the cameras look at.
-        photos: one entry per view.
         agreement: of the masks with the poses; None without masks, or if all cameras are at one place.
     """
 
@@ -45,11 +42,7 @@ class Check:
 
 @check_arguments
 def check_scene(
-    scene: Scene,
-    regions: Regions | None = None,
-    *,
-    photos: Photos | None = None,
-    is_detected: bool = False,
+    scene: Scene, regions: Regions | None = None, *, photos: Photos | None = None, is_detected: bool = False
 ) -> Check:
     """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks.
 
@@ -73,17 +66,12 @@ def check_scene(
     agreement = None
     if regions is not None:
         check_views(regions, scene.cameras)
-        select = detected_findings if is_detected else mask_findings
-        findings += select(regions, scene.cameras, names)
+        findings += mask_findings(regions, scene.cameras, names, is_detected=is_detected)
         if not bool(is_coincident(scene.cameras).all()):
             agreement = pairwise_agreement(regions, scene.cameras)
             findings += low_fit_findings(regions, scene.cameras, agreement, is_detected=is_detected)
             findings += pose_findings(agreement, names) + group_findings(agreement, names)
+    causes = keep_causes(findings)
     return Check(
-        scene=scene,
-        regions=regions,
-        findings=keep_causes(findings),
-        coverage=coverage,
-        photos=tuple(facts),
-        agreement=agreement,
+        scene=scene, regions=regions, findings=causes, coverage=coverage, photos=tuple(facts), agreement=agreement
     )

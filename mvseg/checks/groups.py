@@ -24,16 +24,8 @@ def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
     views = view_agreement(pairs)
     if not views.agree:
         return ()
-    kept = np.array([view for view in np.flatnonzero(~np.isnan(views.fitting)) if view not in views.off], int)
-    groups, waiting = [], [kept]
-    while waiting:
-        members = waiting.pop()
-        parts = _split(pairs, members)
-        if parts is None:
-            groups.append(tuple(members.tolist()))
-        else:
-            waiting += parts
-    return tuple(sorted(groups, key=lambda group: (-len(group), group)))
+    members = np.array([view for view in np.flatnonzero(~np.isnan(views.fitting)) if view not in views.off], int)
+    return tuple(sorted(_split(pairs, members), key=lambda group: (-len(group), group)))
 
 
 def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
@@ -49,14 +41,15 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
     return list_findings([("separate_worlds", level, group, shares) for group in groups[1:]], names)
 
 
-def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:
-    if len(members) < 2 * AGREEMENT.smallest:
-        return None
-    order = members[_order(pairs, members)]
-    cuts = [(order[:cut], order[cut:]) for cut in range(AGREEMENT.smallest, len(order) - AGREEMENT.smallest + 1)]
-    found = [(_contrast(pairs, *cut), cut) for cut in cuts]
-    contrast, (one, other) = min(found, key=lambda each: each[0])
-    return [np.sort(one), np.sort(other)] if contrast < AGREEMENT.apart and _is_off(pairs, one, other) else None
+def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[tuple[int, ...]]:
+    """Split views in two for the best contrast, as often as it is good enough."""
+    if len(members) >= 2 * AGREEMENT.smallest:
+        order = members[_order(pairs, members)]
+        cuts = [(order[:cut], order[cut:]) for cut in range(AGREEMENT.smallest, len(order) - AGREEMENT.smallest + 1)]
+        one, other = min(cuts, key=lambda cut: _contrast(pairs, *cut))
+        if _contrast(pairs, one, other) < AGREEMENT.apart and _is_off(pairs, one, other):
+            return [*_split(pairs, np.sort(one)), *_split(pairs, np.sort(other))]
+    return [tuple(members.tolist())]
 
 
 def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64]:

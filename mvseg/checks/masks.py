@@ -14,18 +14,16 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 
-def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """The findings about the D masks of V views."""
-    rules = mask_faults(regions, cameras.sizes.tolist())
+def mask_findings(
+    regions: Regions, cameras: Cameras, names: tuple[str, ...], *, is_detected: bool = False
+) -> list[Finding]:
+    """The findings about the D masks of V views. Those that a detector found are cut, if anything."""
+    rules = _size_rules(regions, cameras) if len(regions) else []
+    if is_detected:
+        return list_findings(rules, names)
     if len(regions):
-        rules += [*_count_rules(regions.num_per_view.numpy()), *_size_rules(regions, cameras)]
-        rules.append(_small_component_rule(regions, cameras))
-    return list_findings(rules, names)
-
-
-def detected_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """The findings about D masks that a detector found: they are cut, if anything."""
-    return list_findings(_size_rules(regions, cameras) if len(regions) else [], names)
+        rules = [*_count_rules(regions.num_per_view.numpy()), *rules, _small_component_rule(regions, cameras)]
+    return list_findings([*mask_faults(regions, cameras.sizes.tolist()), *rules], names)
 
 
 def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:

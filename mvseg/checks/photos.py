@@ -28,7 +28,6 @@ class PhotoFacts:
         size: width and height as stored; None for a photo that is missing or cannot be read.
         problem: why it cannot be read; "" otherwise, also for a missing one.
         turned: EXIF asks viewers to turn it.
-        exposure: see `read_exposure`.
     """
 
     size: tuple[int, int] | None = None
@@ -45,7 +44,6 @@ class PhotoFacts:
 
 
 def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
-    """One entry per view."""
     views = progress_bar(range(len(photos.scene.views)), name="checking photos", unit="photo")
     return [_read_facts(photos, view) for view in views]
 
@@ -62,9 +60,8 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
             rules.append(("missing_photos", "error", missing, where))
         else:
             rules.append(("no_photos", "note", None, {}) if has_masks else ("no_photos_no_masks", "error", None, where))
-    rules += [
-        ("broken_photo", "error", (view,), {"reason": each.problem}) for view, each in enumerate(facts) if each.problem
-    ]
+    broken = [(view, each.problem) for view, each in enumerate(facts) if each.problem]
+    rules += [("broken_photo", "error", (view,), {"reason": problem}) for view, problem in broken]
     return list_findings([*rules, *_size_rules(facts, scene), *_content_rules(facts), *_exposure_rules(facts)], names)
 
 

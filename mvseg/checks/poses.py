@@ -110,9 +110,8 @@ def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
         off.append(worst)
     agree = len(agreeing) > max(1, num_views / 2)
     fitting, offset = _against(pairs, agreeing if agree else list(range(num_views)))
-    return ViewAgreement(
-        fitting=fitting, offset_px=offset * pairs.unit_px, off=tuple(sorted(off)) if agree else (), agree=agree
-    )
+    alone = tuple(sorted(off)) if agree else ()
+    return ViewAgreement(fitting=fitting, offset_px=offset * pairs.unit_px, off=alone, agree=agree)
 
 
 def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
@@ -127,10 +126,8 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     if not view.agree:
         share, px = float(np.nanmedian(view.fitting)), float(np.nanmedian(view.offset_px))
         return list_findings([("poses_disagree", level, None, {"share": share, "px": px})], names)
-    rules: list[Rule] = [
-        ("view_off", level, (each,), {"share": float(view.fitting[each]), "px": float(view.offset_px[each])})
-        for each in view.off
-    ]
+    share_of, px_of = view.fitting.tolist(), view.offset_px.tolist()
+    rules: list[Rule] = [("view_off", level, (n,), {"share": share_of[n], "px": px_of[n]}) for n in view.off]
     missed = np.flatnonzero(view.offset_px >= AGREEMENT.offset * pairs.unit_px).tolist()
     missing = [index for index in missed if index not in view.off] if len(names) >= AGREEMENT.few_views else []
     most = float(view.offset_px[missing].max(initial=0))
@@ -206,6 +203,6 @@ def _offset(first: _Spans, second: _Spans, unit_px: float) -> float:
     units = torch.arange(-AGREEMENT.most_offset, AGREEMENT.most_offset + 1).double()
     apart = (first.ends[:, None] - second.ends) / torch.hypot(first.pitch[:, None], second.pitch) / unit_px
     residuals = (apart - units[:, None, None, None]).abs().amax(3)
-    votes = sum(torch.exp(-((residuals.amin(axis) / AGREEMENT.sharpness) ** 2)).sum(1) for axis in (1, 2))
-    assert isinstance(votes, Tensor)
+    one, other = (torch.exp(-((residuals.amin(axis) / AGREEMENT.sharpness) ** 2)).sum(1) for axis in (1, 2))
+    votes = one + other
     return float(units[votes == votes.max()].abs().min())

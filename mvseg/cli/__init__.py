@@ -1,4 +1,4 @@
-"""The command `mvseg <verb>`: one file per verb."""
+"""The command `mvseg <verb>`: one file per verb, whose `add_options` adds its options; `run` returns the exit code."""
 
 from __future__ import annotations
 

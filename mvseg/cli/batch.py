@@ -13,7 +13,6 @@ SOME_FAILED = 3  # definition: exit code where some scenes failed
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     help_scenes = "CSV table (columns scene, and if you like name, masks, plant, time, ...), or folder of scene folders"
     parser.add_argument("scenes", type=Path, help=help_scenes)
     add_run_options(parser)
@@ -25,20 +24,12 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.batch.run_batch import run_batch  # keeps --help and wrong options quick
     from mvseg.formats.photos import scene_name
 
     out = args.out or DEFAULT_OUT / Path(scene_name(args.scenes)).stem
-    counts = run_batch(
-        args.scenes,
-        out,
-        build_run(args),
-        masks=args.masks,
-        resume=args.resume,
-        num_workers=read_workers(args),
-        scheduler=args.scheduler,
-    )
+    options = {name: args[name] for name in ("masks", "resume", "scheduler")}
+    counts = run_batch(args.scenes, out, build_run(args), num_workers=read_workers(args), **options)
     total, tables = counts.done + counts.failed, out / "tables"
     if counts.warned:
         some = f"{counts.warned} of {counts.done} scenes have warnings"

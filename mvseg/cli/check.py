@@ -25,7 +25,6 @@ CHECK_FILE, PLAN_FILE, TARGET_FILE = "check.json", "cameras.png", "target.json"
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md), or a result of mvseg infer"
     parser.add_argument("scene", type=Path, help=help_scene)
     help_out = "folder for check.json (target.json), and for cameras.png, a plan (default: nothing is written)"
@@ -37,7 +36,6 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     if args.target:
         return _run_target(args)
     if args.bar is not None:
@@ -137,14 +135,8 @@ def _print_table(check: Check, place: Path) -> None:
     width = max(4, *(len(view.name) for view in scene.views))
     line = f"{{:{width}}} {{:>11}} {{:>6}} {{:>6}} {{:>8}} {{:>6}} {{:>7}} {{:>5}} {{:>7}}"
     say(line.format("view", "size", "field", "next", "photo", "masks", "border", "fit", "miss"))
-    forms = {
-        "next_deg": "{:.0f}°",
-        "photo": "{}",
-        "masks": "{}",
-        "border": "{}",
-        "fit": "{:.0%}",
-        "miss_px": "{:.0f} px",
-    }
+    forms = {"next_deg": "{:.0f}°", "photo": "{}", "masks": "{}", "border": "{}", "fit": "{:.0%}",
+             "miss_px": "{:.0f} px"}  # fmt: skip
     for row, angle, size in zip(_rows(check), field_of_view(cameras), cameras.sizes.tolist(), strict=True):
         known = ["-" if row[name] is None else form.format(row[name]) for name, form in forms.items()]
         say(line.format(row["view"], "{} x {}".format(*size), f"{angle:.0f}°", *known))
@@ -157,8 +149,7 @@ def _rows(check: Check) -> list[dict[str, Any]]:
 
     num, regions = len(check.scene.views), check.regions
     counts: list[Any] = [None] * num
-    border: list[Any] = [None] * num
-    fit, miss = np.full((2, num), np.nan)
+    border, (fit, miss) = counts, np.full((2, num), np.nan)
     if regions is not None:
         counts = regions.num_per_view.tolist()
         at_border = touches_border(regions, check.scene.cameras)

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
 from types import ModuleType
-from typing import TextIO
+from typing import Any
 
 from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
@@ -88,17 +88,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return TERMINATED
 
 
-def _show_warning(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _show_warning(message: Warning | str, category: type[Warning], *place: Any, **_: Any) -> None:
     text = f"mvseg: warning: {message}\n"
     if not issubclass(category, InputWarning):
-        text = warnings.formatwarning(message, category, filename, lineno, line)
+        text = warnings.formatwarning(message, category, *place[:2])
     say(text, end="", to_stderr=True)
 
 
@@ -111,10 +104,9 @@ def _parse(arguments: Sequence[str]) -> Namespace:
         short = not {"--help_all", "--print_completion"} & {*arguments}
         words = ["--help" if word == "--help_all" else word for word in arguments]
         args = build_parser(short=short).parse_args(words)
-        for name in ("quiet", "report", "coco_crowd", "overwrite"):
-            if args.verb and name in args[args.verb] and args[args.verb][name] is None:
-                raise InputError(f"{name} is null, expected a value")
         for name, value in args[args.verb].items() if args.verb else ():
+            if value is None and name in ("quiet", "report", "coco_crowd", "overwrite"):
+                raise InputError(f"{name} is null, expected a value")
             if "\0" in str(value):  # a YAML file can hold one
                 raise InputError(f"{name} is {str(value)!r}, expected text without null characters")
         return args
@@ -128,9 +120,8 @@ def _parse(arguments: Sequence[str]) -> Namespace:
 
 def build_parser(*, short: bool = False) -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed. With `short`, `--help` shows some options only."""
-    parser = ArgumentParser(
-        prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__, formatter_class=_Help
-    )
+    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
+    parser.formatter_class = _Help
     verbs = parser.add_subcommands(dest="verb")
     for name, (verb, about) in VERBS.items():
         of_verb = ArgumentParser(exit_on_error=False, description=verb.__doc__)

@@ -16,7 +16,6 @@ from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     parser.add_argument("result", type=Path, help="result folder of mvseg infer or match, or output of mvseg track")
     parser.add_argument("--plant", type=str | None, help="of an output of mvseg track with several plants")
     parser.add_argument("--no_browser", action="store_true", help="only print the address, do not open the browser")

@@ -14,16 +14,13 @@ from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     parser.add_argument("result", type=Path, help="result folder, the --out of mvseg match, or label PNGs")
     parser.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids, or a result")
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
-    from mvseg.evaluation.agreement import compare_annotators
     from mvseg.evaluation.id_metrics import matching_metrics
-    from mvseg.evaluation.panoptic import leaf_metrics
+    from mvseg.evaluation.panoptic import compare_annotators, leaf_metrics
     from mvseg.evaluation.truth import true_instances
     from mvseg.regions import IGNORE_LABEL
     from mvseg.results.earlier import check_file

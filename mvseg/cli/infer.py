@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run
+from mvseg.cli.options import DEFAULT_OUT, OF_REQUEST, add_run_options, add_shared, build_run
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     help_again = "repeat the run that made this result, with its options and, if given, with other --corrections"
@@ -29,11 +28,10 @@ def add_options(parser: ArgumentParser) -> None:
     help_detector = "with --again: weights that have learned this plant, in place of those of the run"
     parser.add_argument("--detector", type=Path | None, help=help_detector)
     add_run_options(parser)
-    add_shared(parser, "corrections", "force_corrections", "overwrite", "num_workers")
+    add_shared(parser, *OF_REQUEST, "num_workers")
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     if now_running().progress and sys.stderr.isatty():
         show_line("mvseg: starting")  # the imports take seconds
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
@@ -50,16 +48,8 @@ def run(args: Namespace) -> int:
     if args.scene is None:
         say("mvseg: no SCENE given: this is the plant that ships with mvseg", to_stderr=True)
     scene = args.scene or demo_scene()
-    request = RunRequest(
-        scene,
-        args.masks,
-        args.out or DEFAULT_OUT / scene_name(scene),
-        build_run(args),
-        corrections=args.corrections,
-        force_corrections=args.force_corrections,
-        overwrite=args.overwrite,
-    )
-    run_one_scene(request, num_workers=num_workers)
+    out, shared = args.out or DEFAULT_OUT / scene_name(scene), {name: args[name] for name in OF_REQUEST}
+    run_one_scene(RunRequest(scene, args.masks, out, build_run(args), **shared), num_workers=num_workers)
     return 0
 
 
@@ -76,11 +66,6 @@ def _request_again(args: Namespace) -> RunRequest:
             "and --quiet"
         )
     sweep_abandoned(args.again)
-    request = repeat_run(
-        find_result(args.again),
-        out=args.out,
-        learn=None if learn == "auto" else learn,
-        detector=args.detector,
-        corrections=args.corrections,
-    )
+    options = {name: args[name] for name in ("out", "detector", "corrections")}
+    request = repeat_run(find_result(args.again), learn=None if learn == "auto" else learn, **options)
     return replace(request, force_corrections=args.force_corrections, overwrite=args.overwrite)

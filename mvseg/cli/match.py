@@ -7,21 +7,19 @@ from pathlib import Path
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.complain import complain
-from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_shared, build_options
+from mvseg.cli.options import DEFAULT_OUT, OF_REQUEST, add_matching_options, add_shared, build_options
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     add_matching_options(parser, masks=Path("masks"))
-    add_shared(parser, "corrections", "force_corrections", "overwrite")
+    add_shared(parser, *OF_REQUEST)
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.runs.request import RunRequest
@@ -34,20 +32,12 @@ def run(args: Namespace) -> int:
         raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
     plain = {name: args[name] for name in ("report", "coco_crowd", "categories")}
+    shared = {name: args[name] for name in OF_REQUEST}
     match = build_options(MatchConfig, args.match, "match.")
     config = RunConfig(views="all", match=match, reconstruct=None, **plain)
     for scene, name in zip(args.scenes, names, strict=True):
-        request = RunRequest(
-            scene,
-            args.masks,
-            out / name,
-            config,
-            corrections=args.corrections,
-            force_corrections=args.force_corrections,
-            overwrite=args.overwrite,
-        )
         try:
-            run_one_scene(request)
+            run_one_scene(RunRequest(scene, args.masks, out / name, config, **shared))
         except InputError as error:  # the other scenes still get their results
             code = complain(error)
     return code

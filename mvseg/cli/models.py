@@ -12,7 +12,6 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.detectors.zoo import list_detectors
 
     for entry in list_detectors():

@@ -26,6 +26,7 @@ DEFAULT_OUT = Path("results")
 CAN_BE_OFF = ("stems", "crop", "learn")  # options with that word
 # an installed mvseg carries configs/ inside the package, a checkout has it beside the package
 CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
+STAGES = {"detect": DetectConfig, "match": MatchConfig, "reconstruct": ReconstructConfig, "traits": TraitsConfig}
 Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, PoseConfig)
 
 
@@ -54,9 +55,7 @@ def _with_words(options: Any) -> Any:
     """The same options with "off" in place of false, which YAML makes of off, where that is a choice."""
     if not isinstance(options, dict):
         return options
-    return {
-        name: "off" if each is False and name in CAN_BE_OFF else _with_words(each) for name, each in options.items()
-    }
+    return {name: "off" if own is False and name in CAN_BE_OFF else _with_words(own) for name, own in options.items()}
 
 
 def find_config(name: str) -> Path:
@@ -90,8 +89,10 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
 }  # fmt: skip
 
 
+OF_REQUEST = ("corrections", "force_corrections", "overwrite")  # fields of a `RunRequest` that are options, too
+
+
 def add_shared(parser: ArgumentParser, *names: str) -> None:
-    """Add some of the options that several verbs have."""
     for name in names:
         kind, default, about = SHARED[name]
         form = {"action": "store_true"} if kind is None else {"type": kind, "default": default}
@@ -125,9 +126,8 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_argument("--learn", type=int | bool | Literal["auto", "off"], default="auto", help=help_learn)
     help_stem = "category of the masks of stems, beside --categories of leaves: they count as no leaves"
     parser.add_argument("--stem_category", type=str | None, help=help_stem)
-    parser.add_class_arguments(DetectConfig, "detect")
-    parser.add_class_arguments(ReconstructConfig, "reconstruct")
-    parser.add_class_arguments(TraitsConfig, "traits")
+    for name in ("detect", "reconstruct", "traits"):
+        parser.add_class_arguments(STAGES[name], name)
     help_scale = "multiplies the world's lengths; cameras that say their unit need --unit with it"
     parser.add_argument("--scale", type=float | None, help=help_scale)
     help_unit = "name of the world's unit, after --scale (default: the scene's)"
@@ -138,11 +138,9 @@ def add_run_options(parser: ArgumentParser) -> None:
 def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
     plain = ("views", "scale", "unit", "report", "coco_crowd", "categories", "stem_category")
+    stages: dict[str, Any] = {name: build_options(kind, args[name], f"{name}.") for name, kind in STAGES.items()}
     return RunConfig(
-        detect=build_options(DetectConfig, args.detect, "detect."),
-        match=build_options(MatchConfig, args.match, "match."),
-        reconstruct=build_options(ReconstructConfig, args.reconstruct, "reconstruct."),
-        traits=build_options(TraitsConfig, args.traits, "traits."),
+        **stages,
         learn="off" if args.learn is False else args.learn,  # YAML takes off for false
         up=read_up(args.up),
         **{name: args[name] for name in plain},

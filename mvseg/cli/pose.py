@@ -14,7 +14,6 @@ from mvseg.poses.config import PoseConfig, WorldFacts
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     parser.add_argument("photos", type=Path, help="folder of photos, or of one such folder per camera; or a video")
     parser.add_argument("--out", type=Path, required=True, help="the scene folder")
     parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
@@ -46,7 +45,6 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     world = WorldFacts(
         board=args.board if args.board is None else BoardConfig(**vars(args.board)),
         marker=args.marker,
@@ -79,12 +77,7 @@ def _run_turntable(args: Namespace, world: WorldFacts, config: PoseConfig) -> No
     if not is_board:
         if isinstance(args.angles, float) and not math.isfinite(args.angles):
             raise InputError(f"angles is {args.angles}, expected degrees or a CSV file")
-        pose_turntable_photos(
-            args.photos,
-            args.out,
-            turntable=Path(args.turntable),
-            angles=args.angles,
-        )
+        pose_turntable_photos(args.photos, args.out, turntable=Path(args.turntable), angles=args.angles)
     elif world.board is None:
         raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
     else:

@@ -10,7 +10,6 @@ from mvseg.errors import InputError
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     presets = (
         "paper-eval (144 scenes of 3 to 20 photos), train (888 of 9 photos), wild (108 of 9 photos) or series "
         "(plants on 8 dates each)"
@@ -23,7 +22,6 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     try:
         from mvseg.simulation.dataset import write_dataset
         from mvseg.simulation.series import draw_specs, write_series

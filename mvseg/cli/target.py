@@ -12,12 +12,10 @@ from mvseg.system.say import say
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     parser.add_argument("page", type=Path, help="PDF file to write; A4, to be printed at 100 %%, in colour")
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.formats.target import SIGN, tag_corners, tag_distance, write_target
     from mvseg.results.earlier import check_file
 

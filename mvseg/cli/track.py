@@ -24,7 +24,6 @@ LEAST_NAME = 4  # chosen: characters of a plant's name; "day" is none
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
     parser.add_argument("results", type=Path, nargs="*", help=help_results)
     help_again = "tracks to make anew, as they were made, or with other --corrections"
@@ -44,20 +43,14 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.batch.track_plants import track_plants  # keeps --help quick
     from mvseg.tracking.page import PAGE_FILE
 
     num_workers = read_workers(args)
     asked = _read_again(args) if args.again is not None else _read_results(args)
+    edits, options = args.corrections or asked.corrections, {name: args[name] for name in ("scheduler", "report")}
     tracked = track_plants(
-        asked.plants,
-        asked.folder,
-        corrections=args.corrections or asked.corrections,
-        pots=asked.pots,
-        num_workers=num_workers,
-        scheduler=args.scheduler,
-        report=args.report,
+        asked.plants, asked.folder, corrections=edits, pots=asked.pots, num_workers=num_workers, **options
     )
     for plant in tracked:
         for sentence in plant.warnings:
@@ -84,8 +77,7 @@ def _read_again(args: Namespace) -> RecordedTracks:
         message = f"--again repeats the run of {args.again} with its results, times and pots"
         raise InputError(f"{message}, expected no others")
     sweep_abandoned(args.again)
-    found = read_recorded_tracks(args.again)
-    return replace(found, folder=args.out or args.again)
+    return replace(read_recorded_tracks(args.again), folder=args.out or args.again)
 
 
 def _read_results(args: Namespace) -> RecordedTracks:
@@ -106,7 +98,8 @@ def _read_results(args: Namespace) -> RecordedTracks:
     else:
         if len(times) != len(results):
             raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
-        plants = [PlantResults(args.plant or _name_plant(results) or out.resolve().name, tuple(results), tuple(times))]
+        name = args.plant or _name_plant(results) or out.resolve().name
+        plants = [PlantResults(plant=name, results=tuple(results), times=tuple(times))]
     return RecordedTracks(out, tuple(plants), args.pots, corrections=None)
 
 

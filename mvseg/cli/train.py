@@ -12,14 +12,12 @@ from mvseg.training.config import TrainConfig
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """The options of the verb."""
     help_config = "YAML file with any of these options; train/rosettes.yaml and train/finetune-coco.yaml ship"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_class_arguments(TrainConfig)
 
 
 def run(args: Namespace) -> int:
-    """Run the verb; returns the exit code."""
     from mvseg.training.loop import train
 
     is_first = os.environ.get("RANK", "0") == "0"  # under torchrun only one process logs

@@ -101,9 +101,8 @@ def grow_boxes(boxes: Tensor, masks: Tensor, size: tuple[int, int]) -> Tensor:
 
 def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:
     """torchvision's own, with one copy of the photo (3, H, W) instead of two: 290 MB less at 24 megapixels."""
-    mean, sd = (
-        torch.as_tensor(x, dtype=photo.dtype, device=photo.device) for x in (transform.image_mean, transform.image_std)
-    )
+    numbers = transform.image_mean, transform.image_std
+    mean, sd = (torch.as_tensor(each, dtype=photo.dtype, device=photo.device) for each in numbers)
     return (photo - mean[:, None, None]).div_(sd[:, None, None])
 
 

@@ -116,17 +116,13 @@ def load_detector(weights: str | Path, *, image_size: int | None = None, min_sco
     if min_score is not None:
         detector.roi_heads.score_thresh = min_score
     if image_size is None:
-        detector.transform = _ShrinkOnly.like(detector.transform)
+        own = detector.transform
+        detector.transform = _ShrinkOnly(own.min_size, own.max_size, own.image_mean, own.image_std, own.size_divisible)
     return detector.eval()
 
 
 class _ShrinkOnly(GeneralizedRCNNTransform):  # type: ignore[misc]  # torchvision carries no types
     """Leaves photos alone whose longer side is at most `max_size`."""
-
-    @classmethod
-    def like(cls, transform: GeneralizedRCNNTransform) -> _ShrinkOnly:
-        sizes = (transform.min_size, transform.max_size)
-        return cls(*sizes, transform.image_mean, transform.image_std, transform.size_divisible)
 
     def resize(self, image: Tensor, target: dict[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor] | None]:
         return (image, target) if max(image.shape[-2:]) <= self.max_size else super().resize(image, target)

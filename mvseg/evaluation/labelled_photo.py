@@ -60,11 +60,10 @@ def stack_layers(masks: Sequence[np.ndarray], size: tuple[int, ...]) -> Tensor:
     """The layers of bool masks of this size (H, W): each instance goes into the first layer that is free there."""
     layers = [np.zeros(size, np.int32)]
     for number, mask in enumerate(masks, start=1):
-        free = next((layer for layer in layers if not layer[mask].any()), None)
-        if free is None:
-            free = np.zeros(size, np.int32)
-            layers.append(free)
-        free[mask] = number
+        free = [layer for layer in layers if not layer[mask].any()]
+        if not free:
+            layers += (free := [np.zeros(size, np.int32)])
+        free[0][mask] = number
     return torch.from_numpy(np.stack(layers))
 
 

@@ -3,18 +3,19 @@
 `id_metrics` asks whether the masks at hand got the right ids. Here a missed leaf counts, too, and so does a mask of no
 leaf. MV-PQ is the panoptic quality (Kirillov et al., "Panoptic Segmentation", CVPR 2019) of whole leaves: all pixels of
 an id in all views are one segment. Pixels that the truth ignores count for nobody, and what lies mostly there is no
-false leaf.
+false leaf. Two annotators are compared leaf by leaf in the same way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats.contingency import crosstab
 from torch import Tensor
 
+from mvseg.arrays import Ints
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import count_pairs, share
 from mvseg.matching.partition import separate_unmatched
@@ -78,7 +79,7 @@ class Judged:
         ids: (P,) int64, of each instance; -1 for a mask that is matched to nothing, which is one of its own.
         instance: (D,) int64, the index of each mask's instance.
         labels: of the true instances, ascending.
-        leaf_of_mask: the label of each true mask.
+        leaf_of_mask: (T,) int64, the label of each true mask.
         masks: each mask against the true masks.
         leaves: each instance, in all views, against the true instances.
     """
@@ -86,7 +87,7 @@ class Judged:
     ids: np.ndarray
     instance: np.ndarray
     labels: tuple[int, ...]
-    leaf_of_mask: tuple[int, ...]
+    leaf_of_mask: np.ndarray
     masks: SegmentMatches
     leaves: SegmentMatches
 
@@ -103,7 +104,7 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
     """
     judged = find_all(regions, instance_ids, truth)
     masks, leaves = judged.masks, judged.leaves
-    right, estimated, true = count_shared_pairs(masks, judged.instance, np.array(judged.leaf_of_mask, np.int64))
+    right, estimated, true = count_shared_pairs(masks, judged.instance, judged.leaf_of_mask)
     num_false, num_missed = int(leaves.is_false.sum()), leaves.num_true - leaves.num_right
     return LeafMetrics(
         mask_precision=share(masks.num_right, masks.num_right + int(masks.is_false.sum())),
@@ -121,48 +122,47 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
 def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> Judged:
     """Match each mask, and each instance, to the truth; see `leaf_metrics` for the arguments and what is raised."""
     if len(instance_ids) != len(regions) or len(truth) != regions.num_views:
-        raise InputError(
-            f"{len(instance_ids)} ids and {len(truth)} true label maps, "
-            f"expected {len(regions)} and {regions.num_views}, as many as regions and views"
-        )
+        given = f"{len(instance_ids)} ids and {len(truth)} true label maps"
+        raise InputError(f"{given}, expected {len(regions)} and {regions.num_views}, as many as regions and views")
     numbers = instance_ids.cpu().numpy()
     ids, instance = np.unique(separate_unmatched(numbers), return_inverse=True)
-    visible = [[label for label in np.unique(labels).tolist() if label not in (0, IGNORE_LABEL)] for labels in truth]
-    true_masks = [(view, label) for view, of_view in enumerate(visible) for label in of_view]
-    mask_number = {key: number for number, key in enumerate(true_masks)}
-    leaf_number = {label: number for number, label in enumerate(sorted({label for _, label in true_masks}))}
-    by_mask = [{label: mask_number[view, label] for label in of_view} for view, of_view in enumerate(visible)]
-    by_leaf = [{label: leaf_number[label] for label in of_view} for of_view in visible]
+    visible = [np.setdiff1d(labels, (0, IGNORE_LABEL)) for labels in truth]
+    leaf_of_mask = np.concatenate([np.zeros(0, np.int64), *visible])
+    labels, starts = np.unique(leaf_of_mask), np.cumsum([0, *map(len, visible)])
+    by_mask = (_number(*view, len(leaf_of_mask)) for view in zip(truth, visible, starts, strict=False))
+    by_leaf = (_number(each, labels, 0, len(labels)) for each in truth)
     return Judged(
         ids=np.where(np.isin(ids, numbers), ids, -1),
         instance=instance,
-        labels=tuple(leaf_number),
-        leaf_of_mask=tuple(label for _, label in true_masks),
-        masks=find_segments(regions, np.arange(len(regions)), truth, numbers=by_mask),
-        leaves=find_segments(regions, instance, truth, numbers=by_leaf),
+        labels=tuple(labels.tolist()),
+        leaf_of_mask=leaf_of_mask,
+        masks=find_segments(regions, np.arange(len(regions)), by_mask, num_true=len(leaf_of_mask)),
+        leaves=find_segments(regions, instance, by_leaf, num_true=len(labels)),
     )
 
 
-def find_segments(
-    regions: Regions, segments: np.ndarray, truth: Sequence[np.ndarray], *, numbers: Sequence[Mapping[int, int]]
-) -> SegmentMatches:
+def _number(labels: np.ndarray, names: np.ndarray, start: int, num_true: int) -> np.ndarray:
+    """(H, W) the true segment of each pixel of a label map, as `find_segments` takes it; label `names[k]` is segment
+    `start` + k."""
+    places = np.searchsorted(names, labels) + start
+    return np.select([labels == 0, labels == IGNORE_LABEL], [num_true, num_true + 1], places)
+
+
+def find_segments(regions: Regions, segments: Ints, truth: Iterable[Ints], *, num_true: int) -> SegmentMatches:
     """Match estimated segments to true ones; of several, the one with the largest IoU counts. `segments` (D,) int64 is
-    the segment that each mask is a part of, `truth` are V label maps, and `numbers` V mappings, label -> true segment;
-    segments are numbered from 0 on without gaps."""
+    the segment that each mask is a part of, numbered from 0 on without gaps. `truth` are V maps (H, W) of true segments
+    from 0 to `num_true` - 1; `num_true` is none, and `num_true` + 1 is ignored."""
     num_segments = int(segments.max(initial=-1)) + 1
-    num_true = len({number for of_view in numbers for number in of_view.values()})
-    shared = np.zeros((num_segments, num_true), np.int64)
-    sizes, ignored, true_sizes = (np.zeros(n, np.int64) for n in (num_segments, num_segments, num_true))
-    for view, labels in enumerate(truth):
-        for label, count in _count(labels):
-            if label in numbers[view]:
-                true_sizes[numbers[view][label]] += count
-        for segment, covered in _covered_labels(regions, segments, view, labels=labels):
-            for label, count in _count(covered):
-                (ignored if label == IGNORE_LABEL else sizes)[segment] += count
-                if label in numbers[view]:
-                    shared[segment, numbers[view][label]] += count
-    iou = shared / np.maximum(sizes[:, None] + true_sizes - shared, 1)
+    counts, true_sizes = np.zeros((num_segments, num_true + 2), np.int64), np.zeros(num_true + 2, np.int64)
+    for view, numbers in enumerate(truth):
+        true_sizes += np.bincount(numbers.ravel(), minlength=num_true + 2)
+        members = (regions.view_index == view).nonzero()[:, 0].cpu().numpy()
+        for segment in np.unique(segments[members]).tolist():
+            whole = regions.union(members[segments[members] == segment].tolist())
+            covered = whole.cut(numbers)[whole.pixels.cpu().numpy()]
+            counts[segment] += np.bincount(covered, minlength=num_true + 2)
+    sizes, ignored, shared = counts[:, :-1].sum(1), counts[:, -1], counts[:, :-2]
+    iou = shared / np.maximum(sizes[:, None] + true_sizes[:-2] - shared, 1)
     finds, found_iou = np.full(num_segments, -1), np.zeros(num_segments)
     for number in range(num_true if num_segments else 0):
         best = int(iou[:, number].argmax())
@@ -170,20 +170,6 @@ def find_segments(
             finds[best], found_iou[best] = number, iou[best, number]
     is_false = (finds < 0) & (sizes >= ignored)
     return SegmentMatches(true_segment=finds, iou=found_iou, is_false=is_false, num_true=num_true)
-
-
-def _count(labels: np.ndarray) -> Iterator[tuple[int, int]]:
-    numbers, counts = np.unique(labels, return_counts=True)
-    return zip(numbers.tolist(), counts.tolist(), strict=True)
-
-
-def _covered_labels(
-    regions: Regions, segments: np.ndarray, view: int, *, labels: np.ndarray
-) -> Iterator[tuple[int, np.ndarray]]:
-    members = (regions.view_index == view).nonzero()[:, 0].cpu().numpy()
-    for segment in np.unique(segments[members]).tolist():
-        covered = regions.union(members[segments[members] == segment].tolist())
-        yield segment, covered.cut(labels)[covered.pixels.cpu().numpy()]
 
 
 def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray) -> tuple[int, int, int]:
@@ -194,3 +180,43 @@ def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray)
     together = crosstab(leaf[masks.true_segment[is_right]], ids[is_right]).count
     estimated = np.bincount(ids[is_right | masks.is_false])
     return count_pairs(together), count_pairs(estimated), count_pairs(np.unique(leaf, return_counts=True)[1])
+
+
+@dataclass(frozen=True)
+class SharedLeaf:
+    """A leaf that both have: its ids, and the IoU of all its pixels in all views, above 0.5."""
+
+    leaf: int
+    true: int
+    iou: float
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of two annotators of the same photos.
+
+    Attributes:
+        shared: leaves that both have, by the first's ids.
+        alone: ids of leaves, ascending, that only the first has, but those that the second ignores; masks without an
+            id are none.
+        missed: ids of leaves that only the second has.
+    """
+
+    shared: tuple[SharedLeaf, ...]
+    alone: tuple[int, ...]
+    missed: tuple[int, ...]
+
+
+def compare_annotators(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> Agreement:
+    """Compare masks with ids, of one annotator, with the label maps of another; arguments and errors as in
+    `leaf_metrics`. Exchanged, they have the same shared leaves, as long as masks of one view do not overlap."""
+    judged = find_all(regions, instance_ids, truth)
+    leaves = zip(judged.ids.tolist(), judged.leaves.true_segment.tolist(), judged.leaves.iou.tolist(), strict=True)
+    shared = tuple(
+        SharedLeaf(leaf, judged.labels[true], iou) for leaf, true, iou in sorted(leaves) if leaf > 0 and true >= 0
+    )
+    return Agreement(
+        shared=shared,
+        alone=tuple(leaf for leaf in judged.ids[judged.leaves.is_false].tolist() if leaf > 0),
+        missed=tuple(label for label in judged.labels if label not in {each.true for each in shared}),
+    )

@@ -27,10 +27,8 @@ def true_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: bool
 
 def true_instances(regions: Regions, truth: Sequence[np.ndarray], *, count_background: bool = True) -> Tensor:
     """(D,) int64 on the CPU: `true_instance` of every region; `truth` are V label maps in the frame of the regions."""
-    shown = (
-        true_instance(labels, mask, count_background=count_background) for labels, mask in region_crops(regions, truth)
-    )
-    return torch.tensor(list(shown), dtype=torch.int64)
+    shown = [true_instance(*crop, count_background=count_background) for crop in region_crops(regions, truth)]
+    return torch.tensor(shown, dtype=torch.int64)
 
 
 def region_crops(regions: Regions, truth: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

@@ -49,7 +49,6 @@ class Finding:
         return TOPICS[self.code]
 
     def __str__(self) -> str:
-        """The sentence."""
         words = {name: list_some(each) if isinstance(each, tuple) else each for name, each in self.values.items()}
         return SENTENCES[self.code].format(where=self.where, **words)
 
@@ -94,15 +93,9 @@ def keep_causes(findings: Iterable[Finding]) -> tuple[Finding, ...]:
     A code that comes with views, or as an error, is not told of the whole scene beside it: a reader and a check may
     notice the same.
     """
-    distinct: list[Finding] = []
-    for each in findings:
-        if each not in distinct:
-            distinct.append(each)
+    distinct = list(dict.fromkeys(findings))
     explained = {effect for each in distinct for effect in EXPLAINS.get((each.code, each.level), ())}
     definite = {each.code for each in distinct if each.views or each.level == "error"}
-    causes = [
-        each
-        for each in distinct
-        if each.code not in explained and (each.views or each.level == "error" or each.code not in definite)
-    ]
+    repeated = [each for each in distinct if not each.views and each.level != "error" and each.code in definite]
+    causes = [each for each in distinct if each.code not in explained and each not in repeated]
     return tuple(sorted(causes, key=lambda each: LEVELS.index(each.level)))

@@ -25,15 +25,10 @@ def reconstruct_voxels(
     config: ReconstructConfig,
     surfaces: Surfaces | None = None,
 ) -> Voxels:
-    """Voxels of the instances that need them, as `config.shape` says.
+    """{instance id: voxels} of the instances that need them: of all where `config.shape` is "voxels" or "both", of
+    those without a credible surface where it is "surface". Their crumbs are dropped (`VoxelGrid.without_crumbs`).
 
-    Args:
-        instance_ids: (D,) int64, from 1 on; -1 = no instance.
-        surfaces: {instance id: surface}; None: nobody fitted any.
-
-    Returns:
-        {instance id: voxels}: of all instances with "voxels" or "both", of those without a credible surface with
-        "surface". Their crumbs are dropped (`VoxelGrid.without_crumbs`). Raises as `reconstruct_instances` does.
+    `instance_ids` (D,) int64 are from 1 on; -1 = no instance. Raises as `reconstruct_instances` does.
     """
     if config.shape == "surface":
         credible = [instance for instance, surface in (surfaces or {}).items() if surface.is_credible]

@@ -91,11 +91,7 @@ class VoxelGrid:
 
 @check_arguments
 def reconstruct_instances(
-    regions: Regions,
-    instance_ids: Tensor,
-    cameras: Cameras,
-    *,
-    config: ReconstructConfig = ReconstructConfig(),
+    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, config: ReconstructConfig = ReconstructConfig()
 ) -> dict[int, VoxelGrid]:
     """Back-project every instance that is seen in at least two views.
 

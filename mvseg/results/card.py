@@ -37,12 +37,10 @@ class Card:
     next_step: str
 
     def as_json(self) -> dict[str, str]:
-        """The card as run.json holds it."""
         return {"found": self.summary, "doubt": str(self.doubt or ""), "next_step": self.next_step}
 
 
 def make_card(result: Result, out: Path) -> Card:
-    """The card of a result that is written to `out`."""
     doubt = _gravest(result)
     return Card(_summarize(result), doubt, _next_step(result, doubt, shlex.quote(str(out))))
 

@@ -28,7 +28,7 @@ from mvseg.results.photo_masks import labels_in_photo, mask_in_photo
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.results.run_record import FORMAT
-from mvseg.scene import Scene, View
+from mvseg.scene import View
 from mvseg.system.running import progress_bar
 
 REPORT_FILE = "report.html"
@@ -37,25 +37,16 @@ CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED:
 
 
 def save_result(
-    result: Result,
-    out: Path,
-    run: Mapping[str, Any] | None = None,
-    *,
-    report: bool = True,
-    output: Output = RESULT,
+    result: Result, out: Path, run: Mapping[str, Any] | None = None, *, report: bool = True, output: Output = RESULT
 ) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
 
-    Args:
-        run: entries of run.json besides timings and counts: version, config, inputs, warnings; None: those that a
-            loaded result knows of its run.
-        output: what may be replaced; by default any result.
-
-    Raises:
-        InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
-            broken, or missing while others exist.
+    `run` are entries of run.json besides timings and counts: version, config, inputs, warnings; None: those that a
+    loaded result knows of its run. `output` says what may be replaced; by default any result. Raises InputError: `out`
+    cannot be written or holds something that is not a result (see `check_out`), or a photo is broken, or missing while
+    others exist.
     """
     if run is None:
         run = {} if result.run is None else result.run.as_json()
@@ -92,15 +83,12 @@ def describe_result(result: Result) -> dict[str, Any]:
         "mask_kind": result.mask_kind or None,
         "matched_by": report.method,
         "residual_px": report.residual_px,
-        "matching": {
-            "has_probabilities": report.has_probabilities,
-            "explained": report.explained,
-            "view_explained": shares,
-        },
+        "matching": {"has_probabilities": report.has_probabilities, "explained": report.explained}
+        | {"view_explained": shares},
     }
     if (traits := result.traits) is not None:
-        record["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
-        record["traits"] |= {"up_from": traits.up_from}
+        world = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
+        record["traits"] = world | {"up_from": traits.up_from}
     if (learned := result.learned).agreed_area:
         record["learned"] = {"rounds": learned.rounds, "agreed_area": learned.agreed_area}
     if result.corrections is not None and result.corrections.edits:
@@ -124,16 +112,14 @@ def photos_folder(view: View) -> Path:
 def _write_images(result: Result, folder: Path) -> list[Picture]:
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     pictures = []
-    views = list(enumerate(scene.views))
-    for index, view in progress_bar(views, name="writing pictures", unit="view"):
+    for index, view in progress_bar([*enumerate(scene.views)], name="writing pictures", unit="view"):
         width, height = scene.cameras.sizes[index].tolist()
         write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
-        drawn = draw_overlay(photo, masks, view=index)
         pictures.append(draw_picture(photo, masks, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
-        write_png(overlay, drawn)
+        write_png(overlay, draw_overlay(photo, masks, view=index))
     return pictures
 
 
@@ -143,15 +129,12 @@ def _write_instances(result: Result, folder: Path) -> None:
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         image = {"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height}
-        images.append(image | {"camera": _describe_camera(scene, index)})
+        camera: dict[str, Any] = {name: getattr(scene.cameras, name)[index].tolist() for name in ("K", "R", "t")}
+        if (lens := view.lens) is not None:
+            camera["lens"] = {"model": lens.model_name, "params": list(lens.params)}
+        images.append(image | {"camera": camera})
     shown = progress_bar(range(len(result.regions)), name="writing masks", unit="mask")
     write_coco(folder / "instances.json", images, [_annotate(result, region) for region in shown])
-
-
-def _describe_camera(scene: Scene, view: int) -> dict[str, Any]:
-    cameras, lens = scene.cameras, scene.views[view].lens
-    said = {"K": cameras.K[view].tolist(), "R": cameras.R[view].tolist(), "t": cameras.t[view].tolist()}
-    return said if lens is None else said | {"lens": {"model": lens.model_name, "params": list(lens.params)}}
 
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
@@ -168,6 +151,11 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         source["from_other_views"] = origin == Origin.OTHER_VIEWS
     if origin in CORRECTED:
         source["corrected"] = CORRECTED[origin]
+    masks_of_frames = {"segmentation": encode_mask(mask_in_photo(result, region))}
+    if result.scene.views[view].lens is not None:
+        width, height = result.scene.cameras.sizes[view].tolist()
+        whole = result.regions.mask(region, width, height).cpu().numpy()
+        masks_of_frames["undistorted"] = encode_mask(whole)
     return {
         "image_id": view + 1,
         "instance_id": instance,
@@ -176,14 +164,6 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         "match_score": round(float(masks.match_scores[region]), 4),
         **({} if chance is None else {"probability": round(chance, 4)}),
         **source,
-        "segmentation": encode_mask(mask_in_photo(result, region)),
-        **_undistorted(result, region, view),
+        **masks_of_frames,
         **({"mask_class": kind} if kind != 1 else {}),
     }
-
-
-def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
-    if result.scene.views[view].lens is None:
-        return {}
-    width, height = result.scene.cameras.sizes[view].tolist()
-    return {"undistorted": encode_mask(result.regions.mask(region, width, height).cpu().numpy())}

@@ -59,9 +59,7 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
             (column, row), radius = find_thickest(mask)
             doubt = "?" if masks.match_scores[index] < SURE else ""
             numbers.append((f"{instance}{doubt}", (x + column, y + row), radius))
-    letters = max(0.35, longer / 1100)
-    ink = _write(numbers, size, scale=letters)
-    _print(painted, ink, scale=letters)
+    _write(painted, numbers, scale=max(0.35, longer / 1100))
     return painted
 
 
@@ -88,18 +86,14 @@ def find_thickest(mask: np.ndarray) -> tuple[tuple[int, int], float]:
     return (int(column), int(row)), float(depth.max())
 
 
-def _write(numbers: Sequence[_Number], size: tuple[int, int], *, scale: float) -> np.ndarray:
-    """(height, width) uint8 ink of the numbers in a picture, smaller on small leaves."""
-    ink = np.zeros(size[::-1], np.uint8)
+def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:
+    """Write numbers into a picture, smaller on small leaves."""
+    ink = np.zeros(canvas.shape[:2], np.uint8)
     for text, (column, row), radius in numbers:
         own = float(np.clip(2 * radius / CAPITAL, max(0.35, 0.5 * scale), scale))
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, own, 1)
         corner = (column - width // 2, row + height // 2)
         cv2.putText(ink, text, corner, cv2.FONT_HERSHEY_SIMPLEX, own, 255, max(1, round(2 * own)), cv2.LINE_AA)
-    return ink
-
-
-def _print(canvas: np.ndarray, ink: np.ndarray, *, scale: float) -> None:
     # A thicker stroke underneath would not do as an edge: thickness differs between versions of OpenCV.
     edge = 2 * max(1, round(2 * scale)) + 1
     halo = cv2.dilate(ink, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge)))

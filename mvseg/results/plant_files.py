@@ -19,7 +19,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.results.shapes_file import SURFACES_FILE, VOXELS_FILE, write_surfaces, write_voxels
-from mvseg.results.stem_shapes import stem_parts
+from mvseg.results.stem_shapes import parts_of
 from mvseg.scene import Scene
 from mvseg.traits.measure import Traits
 from mvseg.traits.table import write_long, write_nodes, write_wide
@@ -56,9 +56,8 @@ def write_plant(result: Result, folder: Path) -> None:
         if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
             voxels = result.voxels[instance].mesh()
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
-    for stem in () if result.traits is None else result.traits.stems:
-        for part in stem_parts(stem):
-            meshes[part.name], colors[part.name] = part.mesh(), part.color
+    for part in parts_of(result):
+        meshes[part.name], colors[part.name] = part.mesh(), part.color
     about, extras = describe_world(result.scene), leaf_extras(result.traits)
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
     if result.traits is not None:

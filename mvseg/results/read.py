@@ -97,7 +97,6 @@ class _Instances(BaseModel):
 
 
 def load_learned(folder: Path, run: RunRecord) -> Learned:
-    """Load the weights that the detector has learned from the scene of a result."""
     path = folder / DETECTOR_FILE
     weights = path.read_bytes() if path.is_file() else None
     return Learned(weights=weights, rounds=run.learned.rounds, agreed_area=run.learned.agreed_area)
@@ -175,19 +174,12 @@ def check_unchanged(folder: Path, run: RunRecord) -> None:
 
 
 def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]]:
-    """The masks and ids of a result, and the true labels of its views.
+    """The masks and ids of a result, or of a folder of label PNGs, and the true labels of its views.
 
-    Args:
-        folder: a result folder, or one of label PNGs, too.
-        truth: a folder of label PNGs, one per view, the same number for the same instance in every view; or another
-            result, whose `labels` these are.
-
-    Returns:
-        D regions in the frames of the photos, whose `labels` are the ids of instances.json (-1 = matched to nothing),
-        and V true label maps. Photos without true labels are left out, as an InputWarning says.
-
-    Raises:
-        InputError: the result or the truth is missing or broken; or no photo has true labels.
+    `truth` is a folder of label PNGs, one per view, the same number for the same instance in every view; or another
+    result, whose `labels` these are. Returns D regions in the frames of the photos, whose `labels` are the ids of
+    instances.json (-1 = matched to nothing), and V true label maps. Photos without true labels are left out, as an
+    InputWarning says. Raises InputError: the result or the truth is missing or broken; or no photo has true labels.
     """
     truth = truth / "labels" if (truth / "instances.json").is_file() else truth
     if not truth.is_dir():
@@ -218,15 +210,13 @@ def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:
         for name in (image.name, image.file_name):
             if problem := file_name_problem(name, folder="the folder of the photos"):
                 raise InputError(f"image {name}: {problem}")
-    cameras = [image.camera for image in images]
     photos = find_place(folder, run, run.photos or folder)
     views = []
-    for image, camera in zip(images, cameras, strict=True):
+    for image in images:
         lens = None
-        if camera.lens is not None:
-            size = {"width": image.width, "height": image.height}
+        if (stated := image.camera.lens) is not None:
             try:
-                lens = pycolmap.Camera(model=camera.lens.model, params=camera.lens.params, **size)
+                lens = pycolmap.Camera(model=stated.model, params=stated.params, width=image.width, height=image.height)
             except Exception as error:  # of any kind
                 raise InputError(f"image {image.name}: its lens is none of COLMAP's ({error})") from None
         views.append(View(image.name, photos / image.file_name, lens))
@@ -234,9 +224,9 @@ def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:
         name=run.scene or folder.name,
         views=tuple(views),
         cameras=Cameras(
-            K=_as_tensor([camera.K for camera in cameras], 3, 3),
-            R=_as_tensor([camera.R for camera in cameras], 3, 3),
-            t=_as_tensor([camera.t for camera in cameras], 3),
+            K=_as_tensor([image.camera.K for image in images], 3, 3),
+            R=_as_tensor([image.camera.R for image in images], 3, 3),
+            t=_as_tensor([image.camera.t for image in images], 3),
             sizes=_as_tensor([(image.width, image.height) for image in images], 2),
         ),
         unit=run.unit or "",
@@ -309,14 +299,12 @@ def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: 
     chances = {each.instance_id: each.probability for each in content.annotations if each.probability is not None}
     surfaces: dict[int, LeafSurface] | None = None
     voxels: dict[int, VoxelGrid] | None = None
-    if (path := _find_file(folder, run, "surfaces.npz")) is not None:
-        from mvseg.results.shapes_file import read_surfaces
+    files = [_find_file(folder, run, name) for name in ("surfaces.npz", "voxels.npz")]
+    if any(files):
+        from mvseg.results.shapes_file import read_surfaces, read_voxels
 
-        surfaces, voxels = read_surfaces(path), {}
-    if (path := _find_file(folder, run, "voxels.npz")) is not None:
-        from mvseg.results.shapes_file import read_voxels
-
-        voxels = read_voxels(path)
+        surfaces = None if files[0] is None else read_surfaces(files[0])
+        voxels = {} if files[1] is None else read_voxels(files[1])
     return Instances(probabilities=dict(sorted(chances.items())), surfaces=surfaces, voxels=voxels, traits=traits)
 
 

@@ -84,9 +84,7 @@ class Result:
         seconds: {stage: wall time}.
         mask_kind: source of the masks ("COCO", "label images", ...); "" where a detector found them.
         views_left_out: names of the scene's other views, see `RunConfig.views`.
-        corrections: of the user; None where there were none.
         fates: the outcome of each of them.
-        learned: by the detector from this scene.
         before_edits: the plant before any edit, as `mvseg correct` opens it (`pack_plant`); None: nothing is kept.
         inputs: {path: SHA-256} of the cameras, masks, weights and corrections, as the run read them.
         run: that made a result which was loaded from its folder; None before it was saved.

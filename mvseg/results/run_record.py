@@ -46,8 +46,6 @@ class TraitsRecord(_Part):
 
 
 class LearnedRecord(_Part):
-    """See `Learned`."""
-
     rounds: int = 0
     agreed_area: tuple[float, ...] = ()
 
@@ -88,7 +86,6 @@ class RunRecord(_Part):
             return ()
 
     def as_json(self) -> dict[str, Any]:
-        """Content of the file."""
         return self.model_dump(mode="json", exclude_unset=True)
 
 

@@ -20,6 +20,7 @@ from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Q
 from mvseg.reconstruction.voxels import VoxelGrid
 
 SURFACES_FILE, VOXELS_FILE = "surfaces.npz", "voxels.npz"
+TENSORS = ("coefficients", "covariance", "views", "residual_px", "iou")  # of a `LeafSurface`
 
 
 def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
@@ -59,22 +60,15 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         reasons, names = (_split(each, arrays["num_reasons"]) for each in both)
         coefficients = arrays["coefficients"].reshape(-1, NUM_COEFFICIENTS, 3)
         covariance = arrays["covariance"].reshape(-1, *(3 * NUM_COEFFICIENTS,) * 2)
-        rows = arrays["leaf"], arrays["is_oriented"], coefficients, covariance, views, residuals, ious, reasons, names
-        surfaces = {
-            int(leaf): LeafSurface(
-                coefficients=torch.from_numpy(numbers.copy()),
-                covariance=torch.from_numpy(products.copy()),
-                views=torch.from_numpy(in_views.copy()),
-                residual_px=torch.from_numpy(residual.copy()),
-                iou=torch.from_numpy(iou.copy()),
-                is_oriented=bool(is_oriented),
-                quality=Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True))),
-            )
-            for leaf, is_oriented, numbers, products, in_views, residual, iou, doubts, codes in zip(*rows, strict=True)
-        }
-        for leaf, each in surfaces.items():
-            if not each.exists and (each.coefficients.isfinite().any() or not each.quality.reasons):
+        rows = arrays["leaf"], arrays["is_oriented"], reasons, names, coefficients, covariance, views, residuals, ious
+        surfaces = {}
+        for leaf, is_oriented, doubts, codes, *own in zip(*rows, strict=True):
+            tensors = {name: torch.from_numpy(each.copy()) for name, each in zip(TENSORS, own, strict=True)}
+            quality = Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True)))
+            surface = LeafSurface(**tensors, is_oriented=bool(is_oriented), quality=quality)
+            if not surface.exists and (surface.coefficients.isfinite().any() or not surface.quality.reasons):
                 raise ValueError(f"leaf {leaf} has coefficients that are not finite")
+            surfaces[int(leaf)] = surface
         return ByInstance(surfaces)
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None

@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from mvseg.reconstruction.stem.stem_axis import sweep_circle
+from mvseg.results.result import Result
 from mvseg.traits.nodes import Stem
 
 STEM_COLOR, PETIOLE_COLOR = (126, 104, 66), (170, 176, 120)  # definition: of stems, and of petioles, which are guessed
@@ -39,6 +40,12 @@ class StemPart:
 
     def mesh(self) -> trimesh.Trimesh:
         return sweep_circle(self.points, self.radius)
+
+
+def parts_of(result: Result) -> list[StemPart]:
+    """The stems and petioles of a result; none without traits."""
+    stems = () if result.traits is None else result.traits.stems
+    return [part for stem in stems for part in stem_parts(stem)]
 
 
 def stem_parts(stem: Stem) -> Iterator[StemPart]:

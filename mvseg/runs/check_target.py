@@ -10,13 +10,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pycolmap
 import torch
 from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.filters import threshold_otsu
 
 from mvseg.arrays import Floats
-from mvseg.checks.target_masks import cut_shapes
+from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
@@ -36,6 +39,7 @@ NORMAL_95 = 1.96  # definition: standard deviations
 # chosen: of lengths; 2 % of areas. More is said to be a wrong scale: printers that fit a page shrink it by 3 %, and
 # tags are measured to 0.1 %, so a third more or less changes no verdict about these.
 MOST_OFF = 0.01
+LUMA = np.array([0.299, 0.587, 0.114])  # brightness as JPEG has it
 MOST_OUTSIDE = 1  # chosen: of four: two outside of their 95 % intervals are chance in 1.4 % of sound chains
 
 
@@ -95,7 +99,6 @@ class TargetCheck:
 
     @property
     def verdict(self) -> str:
-        """One sentence."""
         errors = np.array([shape.error for shape in self.shapes])
         for shape in self.shapes:
             if np.isnan(shape.error):
@@ -122,14 +125,10 @@ class TargetCheck:
 def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     """Measure the shapes of the photographed page with the stages of `mvseg infer`.
 
-    The tags tell where shapes are on the photos, and which mask shows which; masks and areas do not.
-
-    Args:
-        folder: scene with photos of the page; its cameras state the unit of their lengths.
-        bar: length of the printed scale bar, by a ruler, mm: a factor of tags and areas.
-
-    Raises:
-        InputError: bad scene; the unit is not known; no tag is seen in two photos; a photo shows no whole shape.
+    The tags tell where shapes are on the photos, and which mask shows which; masks and areas do not. The cameras of the
+    scene state the unit of their lengths; `bar` is the length of the printed scale bar, by a ruler, mm: a factor of
+    tags and areas. Raises InputError: bad scene; the unit is not known; no tag is seen in two photos; a photo shows no
+    whole shape.
     """
     if not 0 < bar < np.inf:
         raise InputError(f"bar is {bar:g}, expected its length in mm, about {BAR:g}")
@@ -148,7 +147,7 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     shapes = dict(enumerate(list_shapes(), start=1))
     with tempfile.TemporaryDirectory() as masks:
         for view in progress_bar(range(len(scene.views)), name="masks", unit="photo"):
-            labels = _cut_view(photos, view, shapes=shapes, world_from_page=alignment.similarity)
+            labels = _cut_view(photos, view, shapes, alignment.similarity)
             write_label_png(Path(masks) / f"{scene.views[view].name}.png", labels)
         result = run_scene(folder, masks)
     printed = bar / BAR
@@ -177,9 +176,7 @@ def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
     return corners
 
 
-def _cut_view(
-    photos: Photos, view: int, *, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d
-) -> NDArray[np.uint16]:
+def _cut_view(photos: Photos, view: int, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d) -> np.ndarray:
     """(H, W) masks of the shapes whole in a photo, with its lens distortion. Raises InputError: none is there."""
     scene = photos.scene
     camera, size, places = scene.cameras[[view]], scene.cameras.sizes[view].numpy(), {}
@@ -212,3 +209,47 @@ def _measured(result: Result, shape: Shape, label: int, *, mm: float, printed: f
         num_masks=int(is_shape.sum()),
         method=area.method,
     )
+
+
+def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floats]]) -> NDArray[np.uint16]:
+    """Label map (H, W) of the shapes that were found in one photo (H, W, 3) RGB, 0 where none is. A mask is what
+    differs in colour from the paper of its cell. The outline only decides whether it is the shape: its edge plays no
+    part in the mask.
+
+    Args:
+        places: {label: cell and outline}, where they should be: (4, 2) pixels around the shape and white paper, which
+            may lie partly outside; and (P, 2) pixels of the shape, all in the photo.
+    """
+    height, width = photo.shape[:2]
+    labels = np.zeros((height, width), np.uint16)
+    for label, (cell, outline) in places.items():
+        low, high = np.floor(cell.min(0)), np.ceil(cell.max(0))
+        (x1, y1), (x2, y2) = (np.clip(each, 0, (width, height)).astype(int) for each in (low, high))
+        part = photo[y1:y2, x1:x2]
+        mask = _cut(part, _fill(cell - (x1, y1), part.shape[:2]))
+        shape = _fill(outline - (x1, y1), part.shape[:2])
+        if (mask & shape).sum() >= IMAGES.least_iou * (mask | shape).sum():
+            labels[y1:y2, x1:x2][mask] = label
+    return labels
+
+
+def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(h, w) bool: the largest piece of a cell that is ink by half or more, by brightness; reflections are filled."""
+    light = ((part + 1.0) / 256) ** IMAGES.gamma
+    lack = 1 - 2 * light[..., 1] / (light[..., 0] + light[..., 2])  # of green, in any light and shade: magenta
+    is_ink = lack > threshold_otsu(lack[is_cell])
+    if not (is_ink & is_cell).any():  # grey all over
+        return is_ink & is_cell
+    colors = np.stack([np.median(light[is_cell & where], 0) for where in (~is_ink, is_ink)])
+    strength = cv2.GaussianBlur((light @ np.linalg.pinv(colors)).sum(2), (0, 0), IMAGES.smooth_px).clip(0)
+    half = colors.mean(0) ** (1 / IMAGES.gamma) @ LUMA
+    pieces, count = ndimage.label((part / 255 @ LUMA < half * strength ** (1 / IMAGES.gamma)) & is_cell)
+    sizes = np.bincount(pieces.ravel(), minlength=count + 1)
+    sizes[0] = 0
+    return np.asarray(ndimage.binary_fill_holes(pieces == sizes.argmax()))
+
+
+def _fill(polygon: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
+    filled = np.zeros(size, np.uint8)
+    corners = np.round((polygon - 0.5) * (1 << IMAGES.shift)).astype(np.int32)
+    return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=IMAGES.shift), bool)

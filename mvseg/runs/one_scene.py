@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -23,7 +23,7 @@ from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.card import Card, make_card
 from mvseg.results.earlier import Output, check_out
 from mvseg.results.folder import REPORT_FILE, photos_folder, save_result
-from mvseg.results.result import Learned, Result
+from mvseg.results.result import Result
 from mvseg.runs.recorded_run import record_places
 from mvseg.runs.request import RunRequest
 from mvseg.system.atomic import resolve_place, sweep_abandoned
@@ -31,14 +31,6 @@ from mvseg.system.running import now_running, running, timed
 from mvseg.system.say import say
 
 PASSES = 3  # chosen: sizes that the detector looks at, of most plants that it does not know, and in each round
-
-
-@dataclass(frozen=True, eq=False)
-class Solved:
-    """The result of a scene, and the card: the last lines of the run."""
-
-    result: Result
-    card: Card
 
 
 def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
@@ -62,8 +54,8 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
         if finds and stack.enter_context(claim_cache(cache, request.scene, overwrite=request.overwrite)):
             say(f"mvseg: going on from the detections in {cache}, for equal photos and options", to_stderr=True)
         with running(num_workers=num_workers):
-            solved = solve_scene(request, cache=cache)
-        result, card, is_shown = solved.result, solved.card, now_running().progress
+            result, card = solve_scene(request, cache=cache)
+        is_shown = now_running().progress
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if request.config.views else "; --views all takes all"
             say(f"mvseg: {num_taken} of {num_taken + left_out} views are taken{more}", to_stderr=True)
@@ -71,7 +63,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
             if finding.level != "note" and not (is_shown and finding == card.doubt):
                 say(f"mvseg: warning: {finding}", to_stderr=True)
         with timed("write"):
-            save_scene(solved, request, output)
+            save_scene(result, card, request=request, output=output)
         if finds:
             delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
@@ -97,41 +89,31 @@ def _plan_stages(config: RunConfig, *, finds: bool) -> list[str]:
     return ["load", *first, *shapes, "check", *traits, "write"]
 
 
-def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:
-    """The same options with weights that have learned the scene before, in a file in this folder."""
-    if learned.weights is None:
-        return config
-    path = folder / DETECTOR_FILE
-    path.write_bytes(learned.weights)
-    return replace(config, detect=replace(config.detect, weights=str(path)), learn="off")
-
-
-def solve_scene(request: RunRequest, *, cache: Path) -> Solved:
-    """The result of one scene; warnings that are not of its input are passed on."""
+def solve_scene(request: RunRequest, *, cache: Path) -> tuple[Result, Card]:
+    """The result of one scene, and the card: the last lines of the run; warnings that are not of its input are passed
+    on."""
+    config, learned = request.config, request.learned
     with collect_warnings() as noticed, TemporaryDirectory() as place:
-        if request.masks is not None and request.config.detect != DetectConfig():
+        if request.masks is not None and config.detect != DetectConfig():
             warn(Finding("detect_options_unused"))
-        result = run_scene(
-            request.scene,
-            request.masks,
-            _with_learned(request.config, request.learned, Path(place)),
-            corrections=request.corrections,
-            force_corrections=request.force_corrections,
-            cache=cache,
-        )
-    if request.learned.weights is not None:
-        result = replace(result, learned=request.learned)
+        if learned.weights is not None:
+            path = Path(place) / DETECTOR_FILE
+            path.write_bytes(learned.weights)
+            config = replace(config, detect=replace(config.detect, weights=str(path)), learn="off")
+        masks, edits, force = request.masks, request.corrections, request.force_corrections
+        result = run_scene(request.scene, masks, config, corrections=edits, force_corrections=force, cache=cache)
+    if learned.weights is not None:
+        result = replace(result, learned=learned)
     result = replace(result, findings=keep_causes((*noticed, *result.findings)))
-    return Solved(result, make_card(result, request.out))
+    return result, make_card(result, request.out)
 
 
-def save_scene(solved: Solved, request: RunRequest, output: Output) -> None:
+def save_scene(result: Result, card: Card, *, request: RunRequest, output: Output) -> None:
     """Write the result folder, run.json included. `output`: what may be replaced."""
-    result, config = solved.result, request.config
-    run = describe_run(result, request.masks, config)
-    run["card"] = solved.card.as_json()
+    run = describe_run(result, request.masks, request.config)
+    run["card"] = card.as_json()
     run["config"] |= record_places(request.scene, request.out, request.masks, request.corrections)
-    save_result(result, request.out, run, report=config.report, output=output)
+    save_result(result, request.out, run, report=request.config.report, output=output)
 
 
 def describe_run(result: Result, masks: Path | None, config: RunConfig) -> dict[str, Any]:

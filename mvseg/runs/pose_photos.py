@@ -50,19 +50,17 @@ def pose_photos(
         photos: folder of photos, with one folder per camera below it or none; or a video, of which sharp frames become
             the photos.
         out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
-        world: where scale and axes come from.
         up: the direction of up in the known world, or how to find it.
 
-    Raises:
-        InputError: a photo or the video is broken, the video shows too little motion, too few photos register, world
-            facts do not fit them or name a unit of no length, or `out` holds something else.
+    Raises InputError: a photo or the video is broken, the video shows too little motion, too few photos register, world
+    facts do not fit them or name a unit of no length, or `out` holds something else.
     """
     if world.unit and not world.scales:  # the lengths of the world would get it, and are arbitrary
         raise InputError(f"unit is {world.unit}, and no length is known: expected --marker, --distance, ... with it")
     is_clip, file = is_video(photos), config.calibration
     output = Output("scene", of=(photos,), reads=tuple(path for path in (file, world.positions) if path is not None))
     check_place(out, output)
-    source, names = (photos, []) if is_clip else check_folders(photos, out, output)
+    source, names = (photos, []) if is_clip else list_folder(photos, out)
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if world.positions is not None:
         read_positions(world.positions)  # to find mistakes in it before the minutes that follow
@@ -78,17 +76,15 @@ def pose_photos(
             report = find_lens_fault(structure.model) if calibration is None else LensReport(None, structure.model)
             structure = replace(structure, model=report.model)
             lengths = focal_lengths(structure.model, is_given=calibration is not None)
-            for finding in _lens_findings(report, files):
-                warn(finding)
-            for finding in least_sure(lengths).doubts("focal_length_unsure"):
+            for finding in (*_lens_findings(report, files), *least_sure(lengths).doubts("focal_length_unsure")):
                 warn(finding)
             placement = place(write_structure(structure, folder), world)
             scene = move_structure(structure, placement.similarity, folder)
             scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
             write_cameras(scene, folder)
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
-        run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(world), "up": up}}
         run |= {
+            "config": {"photos": str(photos), **asdict(config), "known": asdict(world), "up": up},
             "square_pixels": "measured" if report.is_square_known else "assumed",
             "up": scene.up,
             "findings": [each.as_json() for each in findings],
@@ -113,10 +109,9 @@ def _lens_findings(report: LensReport, photos: Sequence[PhotoFile]) -> list[Find
     return findings
 
 
-def check_folders(photos: Path, out: Path, output: Output) -> tuple[Path, list[str]]:
-    """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written. Raises
-    InputError: no photos, photos inside `out`, or `out` holds something other than a scene of these photos."""
-    check_place(out, output)
+def list_folder(photos: Path, out: Path) -> tuple[Path, list[str]]:
+    """The folder of the photos and their names, as from `list_photos`. Raises InputError: no photos, or they are inside
+    `out`."""
     source, names = list_photos(photos)
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
@@ -165,34 +160,27 @@ def describe_poses(
 ) -> dict[str, Any]:
     """Entries of pose.json besides options and files."""
     cameras = [camera for _, camera in sorted(structure.model.cameras.items())]
-    turned = [photo.name for photo in files if photo.is_turned]
     return {
         "pycolmap": pycolmap.__version__,
         "photos": len(files),
         "registered": list(structure.registered),
         "not_registered": list(structure.left_out),
         "other_models": list(structure.other_models),
-        "turned_upright": turned,
+        "turned_upright": [photo.name for photo in files if photo.is_turned],
         "residual_px": round(structure.residual_px, 4),
         "points": structure.model.num_points3D(),
         "lenses": [
             {"model": each.model_name, "params": list(map(float, each.params)), "focal_length": asdict(length)}
             for each, length in zip(cameras, lengths, strict=True)
         ],
-        "scale": {
-            "unit": placement.unit,
-            "source": placement.source,
-            "residual": placement.residual,
-            "left_out": list(placement.left_out),
-        },
+        "scale": {name: getattr(placement, name) for name in ("unit", "source", "residual", "left_out")},
     }
 
 
 def summarize_poses(out: Path, structure: Structure, *, placement: Placement, scene: Scene) -> str:
     """The lines that a run ends with."""
-    found, lost = len(structure.registered), len(structure.left_out)
-    points = structure.model.num_points3D()
-    lines = [f"{out}: {found} of {found + lost} photos registered, {structure.residual_px:.2f} px, {points} points"]
+    num, lost, points = len(structure.registered), len(structure.left_out), structure.model.num_points3D()
+    lines = [f"{out}: {num} of {num + lost} photos registered, {structure.residual_px:.2f} px, {points} points"]
     if lost:
         lines.append(f"  not registered: {list_some(structure.left_out)}")
     if structure.other_models:

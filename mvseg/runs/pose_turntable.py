@@ -25,7 +25,7 @@ from mvseg.poses.photo_files import PhotoFile, calibrated_size, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import Output, replace_result
-from mvseg.runs.pose_photos import check_folders
+from mvseg.runs.pose_photos import check_place, list_folder
 from mvseg.scene import Scene
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.say import say
@@ -46,15 +46,15 @@ def pose_board_photos(
         photos: folder of photos that one camera took from one place; or of one folder for each camera, with photos at
             the same angles in the same order.
         out: the scene folder; an earlier one is replaced, files of the user in it stay.
-        board: what is printed; its lengths are in `unit`.
+        board: its lengths are in `unit`.
         calibration: file of OpenCV or ROS with the matrix and distortion of all cameras, which are then not estimated.
 
-    Raises:
-        InputError: see `calibrate_turntable`; the calibration is of another size or a lens that a turntable file cannot
-            hold, a photo is broken, or `out` holds something else.
+    Raises InputError: see `calibrate_turntable`; the calibration is of another size or a lens that a turntable file
+    cannot hold, a photo is broken, or `out` holds something else.
     """
     output = Output("scene", of=(photos,))
-    source, names = check_folders(photos, out, output)
+    check_place(out, output)
+    source, names = list_folder(photos, out)
     given = None if calibration is None else read_calibration(calibration.parent, calibration.name)
     run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
     with replace_result(out, run, output) as folder:
@@ -82,9 +82,8 @@ def pose_board_photos(
         run |= {"residual_px": round(fit.residual_px, 4), "corners": fit.num_corners, "photos": len(files)}
         lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in fit.cameras.items()}
         run["lenses"] = [{"camera": name, "focal_length": asdict(length)} for name, length in lengths.items()]
-        doubts = [
-            each for name, length in lengths.items() for each in length.doubts("turntable_focal_length_unsure", name)
-        ]
+        code = "turntable_focal_length_unsure"
+        doubts = [each for name, length in lengths.items() for each in length.doubts(code, name)]
         run["findings"] = [each.as_json() for each in doubts]
         run["registered"] = [name.removeprefix(f"{IMAGES}/") for name, _, _ in views]
     for finding in doubts:
@@ -102,17 +101,15 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
     """The scene folder of photos from a turntable that was calibrated before; `photos` and `out` are those of
     `pose_board_photos`, folders of cameras named as in the calibration.
 
-    Args:
-        angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
-            of the file, which then has as many views of each camera as there are photos.
-
-    Raises:
-        InputError: photos of a camera that the file does not know, of another number or size than it says, or without
-            an angle; a photo is broken, or `out` holds something else.
+    `angles` are a CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None:
+    those of the file, which then has as many views of each camera as there are photos. Raises InputError: photos of a
+    camera that the file does not know, of another number or size than it says, or without an angle; a photo is broken,
+    or `out` holds something else.
     """
     reads = (turntable, angles) if isinstance(angles, Path) else (turntable,)
     output = Output("scene", of=(photos,), reads=reads)
-    source, names = check_folders(photos, out, output)
+    check_place(out, output)
+    source, names = list_folder(photos, out)
     cameras, known, unit = read_turntable_parts(turntable)
     camera_of = _camera_of(names, list(cameras), turntable)
     angle_of = _angles_of(names, camera_of, known, angles=angles, turntable=turntable)
@@ -125,9 +122,8 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
                 given = f"{size[0]} x {size[1]} pixels, the turntable's camera {expected[0]} x {expected[1]}"
                 raise InputError(f"{file.name} has {given}, expected photos of that camera")
         places = [f"{IMAGES}/{file.name}" for file in files]
-        write_turntable(
-            folder / TURNTABLE_FILE, cameras, list(zip(places, camera_of, angle_of, strict=True)), unit=unit
-        )
+        views = list(zip(places, camera_of, angle_of, strict=True))
+        write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
     if now_running().progress:
         has_step = isinstance(angles, float)
@@ -148,20 +144,14 @@ def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) ->
 
 
 def _angles_of(
-    names: Sequence[str],
-    camera_of: Sequence[str],
-    angles_of: Sequence[tuple[str, float]],
-    *,
-    angles: Angles,
-    turntable: Path,
+    names: list[str], camera_of: list[str], angles_of: list[tuple[str, float]], *, angles: Angles, turntable: Path
 ) -> list[float]:
     if isinstance(angles, Path):
         listed = read_photo_angles(angles)
-        listed_angles = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]
-        for name, angle in zip(names, listed_angles, strict=True):
-            if angle is None:
-                raise InputError(f"{angles}: there is no angle of photo {name}")
-        return [angle for angle in listed_angles if angle is not None]
+        keys = [name if name in listed else name.rpartition("/")[2] for name in names]
+        if absent := [name for name, key in zip(names, keys, strict=True) if key not in listed]:
+            raise InputError(f"{angles}: there is no angle of photo {absent[0]}")
+        return [listed[key] for key in keys]
     places = [camera_of[:index].count(camera) for index, camera in enumerate(camera_of)]
     if angles is not None:
         return [angles * place for place in places]

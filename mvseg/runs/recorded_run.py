@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -39,7 +39,6 @@ class RecordedRun:
 
     Attributes:
         masks: that were given; None: a detector found them.
-        corrections: file of the user's edits; None without any.
         changes: inputs that are other ones now, another version of mvseg, and options that this version no longer has.
     """
 
@@ -113,15 +112,9 @@ def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence
         elif _hash(path) != sha256:
             changes.append(Finding("input_changed", str(path)))
     changes += _list_other_photos(folder, record, scene)
-    before = {name: _option(record, name) for name in GONE}
-    gone = [code for name, (usual, code) in GONE.items() if before[name] not in (None, usual)]
+    before = _flatten(record.config)
+    gone = [code for name, (usual, code) in GONE.items() if before.get(name) not in (None, usual)]
     return changes + [Finding(code, str(folder)) for code in gone]
-
-
-def _option(record: RunRecord, name: str) -> Any:
-    stage, _, own = name.rpartition(".")
-    inside = record.config.get(stage) if stage else record.config
-    return inside.get(own) if isinstance(inside, dict) else None
 
 
 def _hash(path: Path) -> str:
@@ -138,9 +131,7 @@ def _list_other_photos(folder: Path, record: RunRecord, scene: Scene) -> list[Fi
     place, count = find_place(folder, record, record.photos), len(record.photo_sha256)
     photos = {os.path.abspath(view.path) for view in scene.views if view.path.is_file()}
     gone = [name for name in record.photo_sha256 if os.path.abspath(find_file(place / name)) not in photos]
-    others = [
-        name for name, sha256 in record.photo_sha256.items() if name not in gone and _hash(place / name) != sha256
-    ]
+    others = [name for name, own in record.photo_sha256.items() if name not in gone and _hash(place / name) != own]
     return [
         Finding(code, str(place), {"count": len(names), "total": count, "names": tuple(names)})
         for code, names in (("photos_changed", others), ("photos_gone", gone))
@@ -148,19 +139,18 @@ def _list_other_photos(folder: Path, record: RunRecord, scene: Scene) -> list[Fi
     ]
 
 
+def _flatten(options: Mapping[str, Any]) -> dict[str, Any]:
+    """{option: value}, those of stages as "match.seed"."""
+    flat: dict[str, Any] = {}
+    for stage, value in options.items():
+        flat |= {f"{stage}.{name}": each for name, each in value.items()} if isinstance(value, dict) else {stage: value}
+    return flat
+
+
 def _read_config(folder: Path, record: RunRecord) -> RunConfig:
-    options = {
-        stage: {name: each for name, each in value.items() if f"{stage}.{name}" not in GONE}
-        if isinstance(value, dict)
-        else value
-        for stage, value in record.config.items()
-        if stage not in (*PLACES, *GONE, "from_here")
-    }
+    options = {stage: value for stage, value in record.config.items() if stage not in (*PLACES, "from_here")}
     defaults = asdict(RunConfig())
-    unknown = [name for name in options if name not in defaults]
-    for stage, inside in options.items():
-        if isinstance(inside, dict) and isinstance(defaults.get(stage), dict):
-            unknown += [f"{stage}.{name}" for name in inside if name not in defaults[stage]]
+    unknown = [name for name in _flatten(options) if name not in {*defaults, *_flatten(defaults), *GONE}]
     try:
         if unknown:
             raise InputError(f"unknown option {unknown[0]}")

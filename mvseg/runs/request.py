@@ -21,7 +21,6 @@ class RunRequest:
 
     Attributes:
         masks: file or folder; None: a detector finds them.
-        corrections: file of the user's edits; None without any.
         force_corrections: apply them even if they were made for other photos.
         overwrite: replace another scene's result, output of another command, or detected masks in `out`.
         learned: weights that have learned this scene before; they are used, and nothing is learned again.
@@ -38,7 +37,6 @@ class RunRequest:
 
     @property
     def inputs(self) -> tuple[Path, ...]:
-        """The masks and corrections that were given."""
         return tuple(path for path in (self.masks, self.corrections) if path is not None)
 
     def with_found(self, beside: Path = Path()) -> RunRequest:
@@ -59,28 +57,19 @@ def repeat_run(
     """The request that made a result, once more, with its options; stderr says what has changed since. Raises
     InputError: see `read_recorded`.
 
-    Args:
-        out: where the new one goes; None: in its place.
-        learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: the weights learned before
-            are used.
-        detector: file of weights that have learned this scene; None: that of the result, if it has one.
-        corrections: file of the user's edits; None: that of the run, if it had one.
+    Each None stays as it was: the place `out`; the weights learned before, of which `detector` is another file, and
+    `learn` are rounds that learn them anew, see `RunConfig.learn`; and the `corrections`, a file of the user's edits.
     """
     run = read_recorded(folder)
     for change in run.changes:
         say(f"mvseg: {change}", to_stderr=True)
-    learned = load_learned(folder, run.record)
+    learned, config = load_learned(folder, run.record), run.config
     if detector is not None:
         learned = replace(learned, weights=detector.read_bytes(), rounds=1)
-    edits = corrections or run.corrections
-    return RunRequest(
-        run.scene,
-        None if run.masks is None else run.masks.resolve(),
-        folder if out is None else out,
-        run.config if learn is None else replace(run.config, learn=learn),
-        corrections=None if edits is None else Path(edits).resolve(),
-        learned=learned if learn is None else NOTHING_LEARNED,
-    )
+    if learn is not None:
+        learned, config = NOTHING_LEARNED, replace(config, learn=learn)
+    masks, edits = (path and path.resolve() for path in (run.masks, corrections or run.corrections))
+    return RunRequest(run.scene, masks, out or folder, config, corrections=edits, learned=learned)
 
 
 def find_given(scene: Path, given: Path, beside: Path = Path(), *, what: str = "masks") -> Path:

@@ -272,7 +272,7 @@ class Corrector:
         with self.news:
             self._refuse_while_learning()
             if (learner := self._learner()).learned is not None:
-                learner.unlearn()
+                learner.learned = None
                 self._compute_anew()
                 self._notify()
         return {}
@@ -318,7 +318,6 @@ class Corrector:
             self._notify()
 
     def close(self) -> None:
-        """Let everybody who waits go."""
         with self.news:
             self.task = Closed()
             self.news.notify_all()

@@ -47,30 +47,34 @@ class _Handler(BaseHTTPRequestHandler):
     def do_GET(self) -> None:
         corrector, is_number = self.server.corrector, re.compile("[0-9]{1,15}").fullmatch
 
-        def state() -> None:
+        def state() -> dict[str, Any]:
             asked = self._asked("after")
-            self._json(corrector.state(int(asked) if is_number(asked) else -1))
+            return corrector.state(int(asked) if is_number(asked) else -1)
 
-        self._answer({"": lambda: self._send(corrector.page(), "text/html; charset=utf-8"), "state": state})
+        self._answer({"": corrector.page, "state": state})
 
     def do_PUT(self) -> None:
-        self._answer({"edits": lambda: self._json(self.server.corrector.save(self._body(), self._asked("base")))})
+        self._answer({"edits": lambda: self.server.corrector.save(self._body(), self._asked("base"))})
 
     def do_POST(self) -> None:
         corrector = self.server.corrector
-        asked = {
-            place: partial(lambda answer: self._json(answer(self._body())), answer)
-            for place, answer in corrector.opened.answers.items()
+        places: dict[str, Callable[[], Mapping[str, Any]]] = {
+            each.__name__: each for each in (corrector.whole, corrector.learn, corrector.cancel, corrector.unlearn)
         }
-        for act in (corrector.whole, corrector.learn, corrector.cancel, corrector.unlearn):
-            asked[act.__name__] = partial(lambda act: self._json(act()), act)
-        self._answer(asked)
+        for place, answer in corrector.opened.answers.items():
+            places[place] = partial(lambda answer: answer(self._body()), answer)
+        self._answer(places)
 
-    def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
+    def _answer(self, places: Mapping[str, Callable[[], bytes | Mapping[str, Any]]]) -> None:
+        """Send the page, or the JSON, that is asked for."""
         try:
             if (place := self._place()) not in places:
                 raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
-            places[place]()
+            answer = places[place]()
+            if isinstance(answer, bytes):
+                self._send(answer, "text/html; charset=utf-8")
+            else:
+                self._json(answer)
         except Refused as error:
             self._json({"problem": str(error)}, error.status)
         except InputError as error:
@@ -104,10 +108,8 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit() and len(length) < 16):
             raise Refused(HTTPStatus.LENGTH_REQUIRED, "The request does not say how long it is.")
-        if int(length) > EDITS.most_bytes:
-            raise Refused(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {EDITS.most_bytes // 2**20} MiB are not read."
-            )
+        if int(length) > (most := EDITS.most_bytes):
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {most // 2**20} MiB are not read.")
         return self.rfile.read(int(length))
 
     def _json(self, content: Mapping[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:

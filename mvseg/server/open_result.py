@@ -97,7 +97,6 @@ class OpenResult:
         return found, " ".join(filter(None, (self.notice, *map(as_sentence, noticed))))
 
     def mark(self, corrections: Corrections) -> Corrections:
-        """The edits with the marks of the photos that they name."""
         return with_marks(corrections, self.scene, self.marks)
 
     def page(self, corrections: Corrections) -> str:
@@ -107,15 +106,13 @@ class OpenResult:
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         result, outcomes, messages = self.recompute(corrections, is_old)
-        made_with = () if self._saved.corrections is None else self._saved.corrections.edits
+        saved = self.saved_result
+        made_with = () if saved.corrections is None else saved.corrections.edits
         if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
-            result = replace(result, instances=self._saved.instances)
+            result = replace(result, instances=saved.instances)
+        before, pictures = self._page_result
         sizes = result.scene.cameras.sizes.tolist()
-        pictures = [
-            picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
-            for view, picture in enumerate(self._page_result[1])
-        ]
-        before = self._page_result[0]
+        pictures = [each.with_masks(result.masks, view=n, size=tuple(sizes[n])) for n, each in enumerate(pictures)]
         known = () if before.corrections is None else before.corrections.edits
         new = [each for each in corrections.edits if each not in known]
         vanished = tell_vanished(before, result, new=new)
@@ -130,30 +127,25 @@ class OpenResult:
     @cached_property
     def _page_result(self) -> tuple[Result, list[Picture]]:
         """The newest result, and a picture of each view; at first, what lies in the folder."""
-        masks, views = self._saved.masks, range(len(self.scene.views))
-        return self._saved, [draw_picture(self.photos(view), masks, view=view, is_whole=True) for view in views]
-
-    @cached_property
-    def _saved(self) -> Result:
-        return self.saved_result()
+        saved, views = self.saved_result, range(len(self.scene.views))
+        return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
 
     def saved_corrections(self) -> Corrections:
-        """Corrections in the result folder; none without the file."""
         path = self.folder / CORRECTIONS_FILE
         return load_corrections(path) if path.is_file() else Corrections()
 
+    @cached_property
     def saved_result(self) -> Result:
         """The result as it lies in the folder, for the page to begin with; without masks where it shows other views, or
         another version of mvseg wrote it in a way that this one cannot read."""
-        saved, names = None, [view.name for view in self.scene.views]
         with suppress(InputError):
             saved = load_result(self.folder)
-        if saved is None or [view.name for view in saved.scene.views] != names:
-            nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(names)))
-            return Result(self.scene, Matching(nothing, MatchReport("none")))
-        ids = zip(name_regions(saved.regions), saved.masks.instance_ids.tolist(), strict=True)
-        self._numbers.update({name: number for name, number in ids if number > 0})
-        return replace(saved, scene=self.scene, photos=self.photos)
+            if [view.name for view in saved.scene.views] == [view.name for view in self.scene.views]:
+                ids = zip(name_regions(saved.regions), saved.masks.instance_ids.tolist(), strict=True)
+                self._numbers.update({name: number for name, number in ids if number > 0})
+                return replace(saved, scene=self.scene, photos=self.photos)
+        nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(self.scene.views)))
+        return Result(self.scene, Matching(nothing, MatchReport("none")))
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels, bit for bit that of `mvseg infer --again`:
@@ -176,10 +168,8 @@ class OpenResult:
         """Let the detector learn the leaves that the views agree about, and those that the user outlined, in one round
         that begins with the weights of the run; `learned` is the outcome, and None undoes it.
 
-        Raises Cancelled: `is_old`, asked at every step, said so; InputError: masks were given: no detector.
+        Raises Cancelled: `is_old`, asked at every step, said so; InputError: nothing was learned.
         """
-        if self.opened.given is not None:
-            raise InputError("The masks of this result were given, so there is no detector that could learn.")
         with running(is_cancelled=is_old, report=report), collect_warnings() as findings, TemporaryDirectory() as place:
             cache = CachedDetections(Path(place))
             learned = learn(self._plant_before[0], cache=cache, corrections=corrections, rounds=1)
@@ -187,29 +177,23 @@ class OpenResult:
             raise InputError(" ".join(map(as_sentence, findings)))
         self.learned = learned, findings
 
-    def unlearn(self) -> None:
-        """Go back to the detector before it learned."""
-        self.learned = None
-
     def again(self, place: Path) -> list[str]:
         """`mvseg infer --again`, with options by which the detector of the page finds the whole result, whichever lies
         in the folder by now; its weights are written into the folder `place`."""
-        return ["infer", "--again", str(self.folder.resolve()), *self._again_with(place)]
+        weights = self._detector if self.learned is None else self.learned[0].learned.weights
+        again = ["infer", "--again", str(self.folder.resolve())]
+        if weights == _read_detector(self.folder):
+            return again
+        if weights is None:
+            return [*again, "--learn", "off"]
+        (place / DETECTOR_FILE).write_bytes(weights)
+        return [*again, "--detector", str(place / DETECTOR_FILE)]
 
     def reopened(self) -> OpenResult:
         """The result as it is in the folder now."""
         opened = OpenResult(self.folder)
         opened.summary_before = (self.run.record.as_json().get("card") or {}).get("found", "")
         return opened
-
-    def _again_with(self, place: Path) -> list[str]:
-        weights = self._detector if self.learned is None else self.learned[0].learned.weights
-        if weights == _read_detector(self.folder):
-            return []
-        if weights is None:
-            return ["--learn", "off"]
-        (place / DETECTOR_FILE).write_bytes(weights)
-        return ["--detector", str(place / DETECTOR_FILE)]
 
     def outline(self, text: bytes) -> dict[str, Any]:
         """Refine a rough outline, both in pixels of the user's photo. Raises InputError: a request of another form, no
@@ -236,8 +220,8 @@ class OpenResult:
 
     @cached_property
     def _plant_before(self) -> tuple[Plant, list[Finding]]:
-        before = None if (content := self._before_edits()) is None else unpack_plant(content, self.opened)
-        if before is not None:
+        content = self._before_edits()
+        if content is not None and (before := unpack_plant(content, self.opened)) is not None:
             return before
         with collect_warnings() as noticed:
             plant = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
@@ -257,7 +241,6 @@ class OpenResult:
 
 
 def as_sentence(finding: Finding) -> str:
-    """The finding as a sentence of a page."""
     text = str(finding)
     return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith("?") else ".")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +22,6 @@ from mvseg.tracking.page import build_tracks_page, describe_tracks
 from mvseg.tracking.questions import Question, describe_changes, list_questions
 from mvseg.tracking.recorded import PlantResults, RecordedTracks, find_plant_links, read_recorded_tracks
 from mvseg.tracking.track import Tracks, track_leaves
-
-
-@dataclass(frozen=True, eq=False)
-class _TracksPage:
-    tracks: Tracks
-    data: dict[str, Any]
 
 
 class OpenTracks:
@@ -59,51 +53,48 @@ class OpenTracks:
         return replace(corrections, photos=self._photos)
 
     def page(self, corrections: Corrections) -> str:
-        correct = {
-            "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
-            "revision": name_edits(corrections.edits), "folder": str(self.folder.resolve()),
-        }  # fmt: skip
-        return build_tracks_page(self.plant.plant, self._page.data | {"correct": correct})
+        edits = {"edits": dump_edits(corrections.edits), "revision": name_edits(corrections.edits)}
+        correct = {"key": "", "isServed": True, "photos": {}, "folder": str(self.folder.resolve())} | edits
+        return build_tracks_page(self.plant.plant, self._page[1] | {"correct": correct})
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         """The tracks with these edits; then, the effects of the answers to each question. Raises Cancelled: `is_old`
         said so; InputError: see `track_leaves`."""
         links, outcomes = self._links(corrections)
-        self._page = page = self._track(links)
-        yield Update(_without_pictures(page.data), outcomes, [])
+        self._page = tracks, data = self._track(links)
+        yield Update(_without_pictures(data), outcomes, [])
         questions = []
-        for question in list_questions(page.tracks, links):
+        for question in list_questions(tracks, links):
             if is_old():
                 raise Cancelled
             questions.append(_describe_question(question) | {"changes": self._changes(question, links)})
-        page.data["questions"] = questions
-        yield Update(_without_pictures(page.data), outcomes, [])
+        data["questions"] = questions
+        yield Update(_without_pictures(data), outcomes, [])
 
     def again(self, _: Path) -> list[str]:
         """`mvseg track --again`: the tables of all plants."""
         return ["track", "--again", str(self.folder.resolve())]
 
     def reopened(self) -> OpenTracks:
-        """The tracks as they are in the folder now."""
         return OpenTracks(self.folder, self.plant.plant)
 
     def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
         links, problems = find_plant_links(corrections.edits, self.dates)
         return links, [problems.get(index, "") for index in range(len(corrections.edits))]
 
-    def _track(self, links: Sequence[LeafLink]) -> _TracksPage:
+    def _track(self, links: Sequence[LeafLink]) -> tuple[Tracks, dict[str, Any]]:
         tracks = keep_track_numbers(self._track_with(links), self._numbers)
         data = describe_tracks(tracks, measure_growth(tracks))
-        data["questions"] = [_describe_question(each) for each in list_questions(tracks, links)]
-        return _TracksPage(tracks, data)
+        return tracks, data | {"questions": [_describe_question(each) for each in list_questions(tracks, links)]}
 
     def _track_with(self, links: Sequence[LeafLink]) -> Tracks:
         return track_leaves(self.dates, links=links, pots=self.recorded.pots, plant=self.plant.plant)
 
     def _changes(self, question: Question, links: Sequence[LeafLink]) -> list[str]:
+        tracks, _ = self._page
         with suppress(InputError):  # it contradicts what was said before
-            other = question.link(self._page.tracks, is_same=not question.is_linked)
-            return describe_changes(self._page.tracks, self._track_with([*links, other]))
+            other = question.link(tracks, is_same=not question.is_linked)
+            return describe_changes(tracks, self._track_with([*links, other]))
         return []
 
 

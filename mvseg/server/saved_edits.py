@@ -47,20 +47,14 @@ class SavedEdits:
 
     @property
     def name(self) -> str:
-        """The `name_edits` of the newest edits."""
         return name_edits(self.corrections.edits)
 
     def save(self, text: bytes, base: str, mark: Callable[[Corrections], Corrections]) -> None:
-        """Write the edits of a corrections.json.
+        """Write the edits of a corrections.json. `base` is the `name_edits` of the list that this one was made from;
+        `mark` adds marks to the edits before they are written.
 
-        Args:
-            base: the `name_edits` of the list that this one was made from.
-            mark: adds marks to the edits before they are written.
-
-        Raises:
-            InputError: this is no list of edits.
-            Refused: it was made from another list than the one that is saved: it would undo edits of another page.
-            OSError: the file cannot be written; the edits stay as they were.
+        Raises InputError: this is no list of edits; Refused: it was made from another list than the one that is saved,
+        and would undo edits of another page; OSError: the file cannot be written; the edits stay as they were.
         """
         try:
             content = json.loads(text)
@@ -103,7 +97,6 @@ class SavedEdits:
         return True
 
     def write(self) -> None:
-        """Write the newest edits."""
         write_corrections(self.path, self.corrections)
         self._stamp = self._find_stamp()
         self._own.add(self.name)

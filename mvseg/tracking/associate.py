@@ -8,16 +8,16 @@ parts are joined anew, exactly (`linear_sum_assignment`), until that gains nothi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
-from mvseg.arrays import Floats
+from mvseg.arrays import Floats, Ints
 from mvseg.errors import InputError
-from mvseg.tracking.compare import Comparison, Observation, link_chances
+from mvseg.tracking.compare import Asked, Comparison, Observation, link_chances
 from mvseg.tracking.numbers import LINKING
 
 # fitted: slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
@@ -36,11 +36,7 @@ class Association:
 
 
 def link_leaves(
-    counts: Sequence[int],
-    costs: Mapping[tuple[int, int], Floats],
-    *,
-    same: Collection[tuple[Observation, Observation]] = (),
-    different: Collection[tuple[Observation, Observation]] = (),
+    counts: Sequence[int], costs: Mapping[tuple[int, int], Floats], *, same: Asked = (), different: Asked = ()
 ) -> list[Association]:
     """The links of the cheapest tracks, by their earlier observation.
 
@@ -123,9 +119,7 @@ def _rejoin(tracks: np.ndarray, gains: Floats, apart: np.ndarray, among: np.ndar
     return joined
 
 
-def _part_gains(
-    tracks: np.ndarray, gains: Floats, one: np.ndarray, other: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, Floats]:
+def _part_gains(tracks: Ints, gains: Floats, one: np.ndarray, other: np.ndarray) -> tuple[Ints, Ints, Floats]:
     (here, row), (there, column) = (np.unique(tracks[part], return_inverse=True) for part in (one, other))
     return here, there, np.eye(len(here))[row].T @ gains[np.ix_(one, other)] @ np.eye(len(there))[column]
 

@@ -17,6 +17,7 @@ from mvseg.tracking.numbers import ALIGN, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
 Observation = tuple[int, int]  # index of the date, row of its `DateLeaves`
+Asked = Collection[tuple[Observation, Observation]]  # by the user, the earlier one first
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +47,11 @@ def compare_dates(
     *,
     knows_up: bool,
     pots: Pots = "auto",
-    same: Collection[tuple[Observation, Observation]] = (),
-    different: Collection[tuple[Observation, Observation]] = (),
+    same: Asked = (),
+    different: Asked = (),
 ) -> Comparison:
     """Compare dates at most `LINKING.most_gap` apart, once `place_dates` has placed them, before anything is linked.
-    The poses take note of `same` and `different`, pairs of observations, the earlier one first, that the user links."""
+    The poses take note of `same` and `different`, pairs of observations that the user links."""
     still = ALIGN.still if pots == "auto" else 0.0
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up, still=still)

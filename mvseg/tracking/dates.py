@@ -21,7 +21,7 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
 from mvseg.tracking.numbers import OBSERVATIONS
-from mvseg.tracking.pictures import LeafPicture, picture_leaves, picture_plant
+from mvseg.tracking.pictures import LeafPicture, draw_pictures
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
@@ -39,19 +39,20 @@ class Number:
     unit: str
 
 
+Numbers = Mapping[str, Number]  # by trait
+
+
 @dataclass(frozen=True, eq=False)
 class SeenLeaf:
     """One leaf on one date.
 
     Attributes:
-        leaf: its id in that date's result.
         midrib: (stations, 3) float64 from base to tip, evenly spread, in the date's frame: its unit, +z up where up is
             known; None for a leaf without a shape (seen in one view).
         normal: (3,) unit mean normal of the blade; None with the midrib.
         points: (cloud, 3) points of the leaf: of a surface, rows from base to tip of edge, midrib, edge; None with the
             midrib.
         is_oriented: the first point of the midrib is known to be the base.
-        numbers: {trait: number} of measured traits.
         is_doubted: it looks like a stem, as rolled leaves of seedlings do: it counts if another date shows the leaf.
         node: numbers of its stem and of its node there; None: it is not known to sit on one.
     """
@@ -61,7 +62,7 @@ class SeenLeaf:
     normal: Floats | None
     points: Floats | None
     is_oriented: bool
-    numbers: Mapping[str, Number]
+    numbers: Numbers
     is_doubted: bool = False
     node: tuple[int, int] | None = None
 
@@ -76,13 +77,11 @@ class PlantOnDate:
     """One plant on one date.
 
     Attributes:
-        scene: name of the result.
         time: days; of ISO dates, days after the first of all dates.
         written: the time as the user gave it.
         unit: of its lengths, "" when unknown.
         knows_up: +z of its frame is up.
         leaves: those that count as leaves, or may do so, by id.
-        whole: {trait: number} of the plant.
         up_from: where up comes from, see `Traits.up_from`.
         folder: of the result; None in memory.
         pictures: {leaf: picture} for a page; empty where nobody asked for them.
@@ -95,7 +94,7 @@ class PlantOnDate:
     unit: str
     knows_up: bool
     leaves: tuple[SeenLeaf, ...]
-    whole: Mapping[str, Number]
+    whole: Numbers
     up_from: str = ""
     folder: Path | None = None
     pictures: Mapping[int, LeafPicture] = field(default_factory=dict)
@@ -103,7 +102,6 @@ class PlantOnDate:
 
     @property
     def shaped(self) -> list[int]:
-        """Indices of the leaves that have a shape."""
         return [index for index, leaf in enumerate(self.leaves) if leaf.midrib is not None]
 
 
@@ -121,8 +119,8 @@ def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnD
     date = replace(date_of(result, time), scene=folder.name, folder=folder)
     if not pictures:
         return date
-    found = picture_leaves(result, [leaf.leaf for leaf in date.leaves], side=pictures)
-    return replace(date, pictures=found, photo=picture_plant(result))
+    of_leaves, of_plant = draw_pictures(result, [leaf.leaf for leaf in date.leaves], side=pictures)
+    return replace(date, pictures=of_leaves, photo=of_plant)
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:
@@ -220,7 +218,7 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
     factor = UNITS[date.unit] / UNITS[first.unit]
     units = {f"{date.unit}{power}": (f"{first.unit}{power}", factor**n) for n, power in enumerate(("", "^2", "^3"), 1)}
 
-    def convert(numbers: Mapping[str, Number]) -> dict[str, Number]:
+    def convert(numbers: Numbers) -> Numbers:
         found = {name: (number, *units.get(number.unit, (number.unit, 1.0))) for name, number in numbers.items()}
         return {name: Number(n.value * times, n.sd * times, unit) for name, (n, unit, times) in found.items()}
 
@@ -233,9 +231,7 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
     return replace(date, unit=first.unit, leaves=tuple(map(enlarge, date.leaves)), whole=convert(date.whole))
 
 
-def _see_leaf(
-    number: int, shape: LeafSurface | VoxelGrid | None, numbers: Mapping[str, Number], frame: Floats | None
-) -> SeenLeaf:
+def _see_leaf(number: int, shape: LeafSurface | VoxelGrid | None, numbers: Numbers, frame: Floats | None) -> SeenLeaf:
     vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
     if len(vertices) < OBSERVATIONS.cloud:
         return SeenLeaf(number, None, None, None, False, numbers)
@@ -247,9 +243,7 @@ def _see_leaf(
     return SeenLeaf(number, midrib, normal, cloud, False, numbers)
 
 
-def see_surface(
-    number: int, vertices: Floats, columns: int, numbers: Mapping[str, Number], *, is_oriented: bool
-) -> SeenLeaf:
+def see_surface(number: int, vertices: Floats, columns: int, numbers: Numbers, *, is_oriented: bool) -> SeenLeaf:
     """A leaf from the vertices (P, 3) of its surface: the base, rows of a grid with so many columns, and the tip."""
     grid = vertices[1:-1].reshape(-1, columns, 3)
     midrib = resample(np.concatenate([vertices[:1], grid[:, columns // 2], vertices[-1:]]))

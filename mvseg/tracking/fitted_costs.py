@@ -69,7 +69,6 @@ class Differences:
         height: (2, N, M) of the earlier base over the foot of the plant. The foot counts as the origin where that is
             below the lowest base by one `Pair.scale` at most.
         turn: (2, N, M) between the directions from base to tip, radians.
-        base_sd, turn_sd: of the surfaces.
         longer, wider: of lengths, and of roots of areas, NaN where there are none.
         room: from the length of the earlier leaf to that of the longest one of the later date, >= 0.
         is_loose: only voxels show one of them.

@@ -52,22 +52,16 @@ class DateLeaves:
         return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
     def take(self, rows: np.ndarray) -> DateLeaves:
-        """Some of the leaves."""
         return DateLeaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def moved(self, pose: Floats) -> DateLeaves:
         """In another frame, by its pose (4, 4)."""
         rotation, shift = pose[:3, :3], pose[:3, 3]
-        return replace(
-            self,
-            midribs=self.midribs @ rotation.T + shift,
-            normals=self.normals @ rotation.T,
-            points=self.points @ rotation.T + shift,
-        )
+        midribs, points = (each @ rotation.T + shift for each in (self.midribs, self.points))
+        return replace(self, midribs=midribs, normals=self.normals @ rotation.T, points=points)
 
 
 def leaves_of(date: PlantOnDate) -> DateLeaves:
-    """The leaves of a date that have a shape."""
     shaped: Sequence[SeenLeaf] = [date.leaves[index] for index in date.shaped]
 
     def sd(leaf: SeenLeaf, trait: str) -> float:
@@ -125,7 +119,6 @@ class Pair:
 
     @property
     def fewer(self) -> int:
-        """Leaves of the date with fewer."""
         return min(len(self.first), len(self.second))
 
     def moved(self, pose: Floats) -> Pair:

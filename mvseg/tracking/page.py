@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -28,7 +28,6 @@ SERVED_SCRIPTS = ("numbers.js", "edits.js", "server.js")  # of the page that cor
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
-    """Write tracks.html into a folder. Raises OSError."""
     page = build_tracks_page(tracks.plant, describe_tracks(tracks, growth))
     (folder / PAGE_FILE).write_text(page, encoding="utf-8", newline="\n")
 
@@ -36,9 +35,10 @@ def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
 def build_tracks_page(plant: str, data: Mapping[str, Any]) -> str:
     """The page; `data` of `describe_tracks`, with "correct" where `mvseg correct` serves it: {"edits", "revision", and
     the rest that its script reads}."""
-    is_served = "correct" in data
-    scripts = [REPORT_ASSETS / name for name in (*SHARED_SCRIPTS, *(SERVED_SCRIPTS if is_served else ()))]
-    styles = ["tracks.css", *(["tracks_correct.css"] if is_served else [])]
+    styles, scripts = ["tracks.css"], [REPORT_ASSETS / name for name in SHARED_SCRIPTS]
+    if is_served := "correct" in data:
+        styles.append("tracks_correct.css")
+        scripts += [REPORT_ASSETS / name for name in SERVED_SCRIPTS]
     scripts += [ASSETS / name for name in ("tracks.js", *(("tracks_correct.js",) if is_served else ()))]
     return Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"{plant} - mvseg track"),
@@ -89,15 +89,9 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
     return {
         "plant": tracks.plant,
         "dates": [
-            {
-                "scene": date.scene,
-                "time": date.time,
-                "written": date.written,
-                "photo": base64.b64encode(date.photo).decode("ascii"),
-                "leaves": row.leaves,
-                "born": row.born,
-                "gone": row.gone,
-            }
+            {name: getattr(date, name) for name in ("scene", "time", "written")}
+            | {"photo": base64.b64encode(date.photo).decode("ascii")}
+            | {name: getattr(row, name) for name in ("leaves", "born", "gone")}
             for date, row in zip(tracks.dates, growth.plant, strict=True)
         ],
         "knows_up": all(date.knows_up for date in tracks.dates),
@@ -105,33 +99,33 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         "gaps": [[row.date, row.track, row.state] for row in tracks.rows if row.leaf is None],
         "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in sorted({row.track for row in tracks.rows})},
         "warnings": list(map(str, tracks.findings)),
-    } | _describe_growth(growth)
-
-
-def _describe_growth(growth: Growth) -> dict[str, Any]:
-    """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}; and whole, of the plant, as track 0."""
-    numbers: dict[str, dict[str, Any]] = {}
-    for point in growth.points:
-        of_trait = numbers.setdefault(point.trait, {"unit": point.number.unit, "tracks": {}})
-        row = [point.date, _round(point.number.value, 5), _round(point.number.sd, 3) or 0.0]
-        of_trait["tracks"].setdefault(str(point.track), []).append(row)
-    return {"numbers": numbers, "whole": _describe_plant(growth)}
+        "numbers": _describe_numbers((each.trait, each.track, each.date, each.number) for each in growth.points),
+        "whole": _describe_plant(growth),
+    }
 
 
 def _describe_plant(growth: Growth) -> dict[str, Any]:
-    rows = [
-        {"total area": row.total_area, "relative growth rate": row.relative_growth_rate,
-         "leaves": Number(row.leaves, 0.0, ""), "leaves that appeared": Number(row.born, 0.0, ""),
-         "days per new leaf": Number(row.phyllochron, 0.0, "days")}
+    """The plant's own numbers, as those of track 0."""
+    numbers = [
+        (trait, 0, row.date, number)
         for row in growth.plant
+        for trait, number in {
+            "total area": row.total_area, "relative growth rate": row.relative_growth_rate,
+            "leaves": Number(row.leaves, 0.0, ""), "leaves that appeared": Number(row.born, 0.0, ""),
+            "days per new leaf": Number(row.phyllochron, 0.0, "days"),
+        }.items()
     ]  # fmt: skip
-    described = {}
-    for trait in rows[0]:
-        seen = [(row.date, of_date[trait]) for row, of_date in zip(growth.plant, rows, strict=True)]
-        points = [[date, _round(number.value, 5), _round(number.sd, 3) or 0.0]
-                  for date, number in seen if math.isfinite(number.value)]  # fmt: skip
-        units = [number.unit for _, number in seen if math.isfinite(number.value)]
-        described[trait] = {"unit": units[-1] if units else "", "tracks": {"0": points}}
+    nothing = {trait: {"unit": "", "tracks": {"0": []}} for trait, *_ in numbers}
+    return nothing | _describe_numbers(each for each in numbers if math.isfinite(each[-1].value))
+
+
+def _describe_numbers(numbers: Iterable[tuple[str, int, int, Number]]) -> dict[str, Any]:
+    """{trait: {unit, tracks: {track: [[date, value, sd], ...]}}}."""
+    described: dict[str, dict[str, Any]] = {}
+    for trait, track, date, number in numbers:
+        of_trait = described.setdefault(trait, {"unit": number.unit, "tracks": {}})
+        row = [date, _round(number.value, 5), _round(number.sd, 3) or 0.0]
+        of_trait["tracks"].setdefault(str(track), []).append(row)
     return described
 
 

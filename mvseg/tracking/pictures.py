@@ -27,7 +27,6 @@ class LeafPicture:
 
     Attributes:
         jpeg: of the photo around it if it is still there, else of its mask.
-        view: name of the photo.
         at: x, y of a pixel of the leaf far from its edge, in pixels of the photo.
     """
 
@@ -36,8 +35,9 @@ class LeafPicture:
     at: tuple[float, float]
 
 
-def picture_leaves(result: Result, leaves: Collection[int], *, side: int = PAGE.side) -> dict[int, LeafPicture]:
-    """{leaf: its picture, `side` pixels wide or high}; none of a leaf without a mask."""
+def draw_pictures(result: Result, leaves: Collection[int], *, side: int) -> tuple[dict[int, LeafPicture], bytes]:
+    """{leaf: its picture, `side` pixels wide or high}; none of a leaf without a mask. And a JPEG of all leaves in the
+    photo in which they are largest, as `cut_picture`; nothing where there is no mask."""
     labels = [labels_in_photo(result, view) for view in range(len(result.scene.views))]
     count = max(leaves, default=0) + 1
     sizes = np.array([np.bincount(np.minimum(view, count).ravel(), minlength=count + 1) for view in labels])
@@ -50,16 +50,11 @@ def picture_leaves(result: Result, leaves: Collection[int], *, side: int = PAGE.
             jpeg = cut_picture(photo, mask, side=side)
             (column, row), _ = find_thickest(mask.astype(np.uint8))
             pictures[leaf] = LeafPicture(jpeg, about.name, (column + 0.5, row + 0.5))
-    return pictures
-
-
-def picture_plant(result: Result) -> bytes:
-    """JPEG of all leaves in the photo in which they are largest, as `cut_picture`; nothing where there is no mask."""
-    areas = [labels_in_photo(result, view) > 0 for view in range(len(result.scene.views))]
-    view = int(np.argmax([mask.mean() for mask in areas]))
-    if not areas[view].any():
-        return b""
-    return cut_picture(_photo(result.scene.views[view].path, areas[view].shape), areas[view], side=PAGE.plant_side)
+    whole = max(range(len(labels)), key=lambda view: np.mean(labels[view] > 0))
+    if not labels[whole].any():
+        return pictures, b""
+    photo = _photo(result.scene.views[whole].path, labels[whole].shape)
+    return pictures, cut_picture(photo, labels[whole] > 0, side=PAGE.plant_side)
 
 
 def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, model_validator
 
 from mvseg.corrections.file import Edit
 from mvseg.corrections.track_links import LeafLink, find_links
@@ -19,18 +19,23 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import PlantOnDate, name_apart, read_date
 
 
-@dataclass(frozen=True)
-class PlantResults:
+class PlantResults(BaseModel, frozen=True):
     """One plant to track: its name, its result folders and their times as the user gave them."""
 
     plant: str
-    folders: tuple[Path, ...]
+    results: tuple[Path, ...]
     times: tuple[str, ...]
+
+    @model_validator(mode="after")
+    def _as_many(self) -> PlantResults:
+        if len(self.results) != len(self.times):
+            raise ValueError(f"{len(self.times)} times for {len(self.results)} results, expected one for each")
+        return self
 
     def read(self, *, pictures: int) -> list[PlantOnDate]:
         """Its dates, those with results of one name told apart; for `pictures` see `read_date`. Raises InputError: see
         `read_date`; or one has no time."""
-        dated = list(zip(self.folders, self.times, strict=True))
+        dated = list(zip(self.results, self.times, strict=True))
         missing = [folder.name for folder, time in dated if not time]
         if missing:
             raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
@@ -43,7 +48,6 @@ class RecordedTracks:
 
     Attributes:
         plants: in their order; the results are where they are now, if they moved together with the tracks.
-        pots: see `track_leaves`.
         corrections: the file of links that were given, if it is still there.
     """
 
@@ -53,44 +57,20 @@ class RecordedTracks:
     corrections: Path | None
 
 
-class _Part(BaseModel):
-    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="ignore")
-
-
-class _Plant(_Part):
-    plant: str
-    results: tuple[str, ...]
-    times: tuple[str, ...]
-
-    @model_validator(mode="after")
-    def _as_many(self) -> _Plant:
-        if len(self.results) != len(self.times):
-            raise ValueError(f"{len(self.times)} times for {len(self.results)} results, expected one for each")
-        return self
-
-
-class _Config(_Part):
-    plants: tuple[_Plant, ...] = ()
+class _Config(BaseModel):
+    plants: tuple[PlantResults, ...] = ()
     pots: Pots = "auto"
-    corrections: str | None = None
+    corrections: Path | None = None
 
 
-class _Output(_Part):
+class _Output(BaseModel):
     kind: Literal["tracks"]
     of: dict[str, str | None]
 
 
-class _Run(_Part):
+class _Run(BaseModel):
     config: _Config
-    output: _Output | None = Field(None)
-
-
-def record_plants(plants: Sequence[PlantResults]) -> list[dict[str, Any]]:
-    """Entries of run.json about them, with absolute paths."""
-    return [
-        {"plant": each.plant, "results": [str(path.resolve()) for path in each.folders], "times": list(each.times)}
-        for each in plants
-    ]
+    output: _Output | None = None
 
 
 def find_plant_links(edits: Sequence[Edit], dates: Sequence[PlantOnDate]) -> tuple[list[LeafLink], dict[int, str]]:
@@ -100,7 +80,6 @@ def find_plant_links(edits: Sequence[Edit], dates: Sequence[PlantOnDate]) -> tup
 
 
 def is_tracks(folder: Path) -> bool:
-    """Whether a folder was written by `mvseg track`."""
     return (folder / "tracks.csv").is_file() and (folder / RUN_FILE).is_file()
 
 
@@ -116,16 +95,14 @@ def read_recorded_tracks(folder: Path) -> RecordedTracks:
         raise InputError(f"{folder}: {message}; expected those of mvseg track of this version")
     from_here = record.output.of
 
-    def find(stated: str) -> Path:
-        moved = from_here.get(stated)
-        places = [Path(stated), *([] if moved is None else [(folder / moved).resolve()])]
-        found = next((place for place in places if place.is_dir()), None)
-        if found is None:
+    def find(stated: Path) -> Path:
+        moved = from_here.get(str(stated))
+        place = stated if stated.is_dir() or moved is None else (folder / moved).resolve()
+        if not place.is_dir():
             raise InputError(f"{stated}: the result that {folder} was made of is gone, expected it there")
-        return found
+        return place
 
-    listed = record.config.plants
-    plants = tuple(PlantResults(each.plant, tuple(map(find, each.results)), each.times) for each in listed)
-    stated = record.config.corrections
-    corrections = Path(stated) if stated is not None and Path(stated).is_file() else None
-    return RecordedTracks(folder, plants, record.config.pots, corrections)
+    config = record.config
+    plants = tuple(each.model_copy(update={"results": tuple(map(find, each.results))}) for each in config.plants)
+    corrections = config.corrections if config.corrections is not None and config.corrections.is_file() else None
+    return RecordedTracks(folder, plants, config.pots, corrections)

@@ -33,8 +33,8 @@ def write_track_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
         rows[file].append((tracks.plant, *values))
 
     for row in tracks.rows:
-        date, probability = tracks.dates[row.date], round(row.probability, 4)
-        add("tracks.csv", date.written, date.scene, row.leaf, row.track, probability, row.state)
+        date = tracks.dates[row.date]
+        add("tracks.csv", date.written, date.scene, row.leaf, row.track, round(row.probability, 4), row.state)
     for point in growth.points:
         number, time = point.number, tracks.dates[point.date].written
         measured = number.value, number.sd, number.unit, point.rate, point.rate_sd

@@ -16,7 +16,7 @@ from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.tracking.associate import Association, link_leaves, pairwise_chances, sum_over_poses
-from mvseg.tracking.compare import Comparison, Observation, compare_dates
+from mvseg.tracking.compare import Asked, Comparison, Observation, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import PlantOnDate, date_of, name_apart, order_dates, read_date
 from mvseg.tracking.leaves import leaves_of
@@ -158,15 +158,13 @@ def _without_stems(
     return tuple(believed)
 
 
-def _observations_of(
-    links: Sequence[LeafLink], dates: Sequence[PlantOnDate]
-) -> tuple[list[tuple[Observation, Observation]], list[tuple[Observation, Observation]]]:
+def _observations_of(links: Sequence[LeafLink], dates: Sequence[PlantOnDate]) -> tuple[Asked, Asked]:
     """Pairs of rows of `Leaves` that are one leaf, in the order of time, and pairs that are not."""
     rows = {date.scene: (index, {date.leaves[n].leaf: k for k, n in enumerate(date.shaped)})
             for index, date in enumerate(dates)}  # fmt: skip
     if links and len(rows) < len(dates):
         raise InputError("two dates have results of one name, expected different names where links name them")
-    same, different = [], []
+    same, different = list[tuple[Observation, Observation]](), list[tuple[Observation, Observation]]()
     for link in links:
         observations = []
         for scene, leaf in link.leaves:

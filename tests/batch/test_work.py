@@ -102,7 +102,7 @@ def test_other_options_are_done_again(scene: BatchScene, tmp_path: Path) -> None
 
 def test_other_code_does_it_again(scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for code, is_kept in (("one", False), ("one", True), ("other", False)):
-        monkeypatch.setattr("mvseg.batch.scene_key.code_hash", lambda code=code: code)
+        monkeypatch.setattr("mvseg.batch.work.code_hash", lambda code=code: code)
         assert work_on_scene(tmp_path / "out", CONFIG, scene).is_kept == is_kept
 
 

@@ -15,7 +15,7 @@ from mvseg.corrections.track_links import leaf_at
 from mvseg.results.read import load_result
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
-from mvseg.tracking.pictures import LeafPicture, cut_picture, picture_leaves
+from mvseg.tracking.pictures import LeafPicture, cut_picture, draw_pictures
 from mvseg.tracking.track import TrackRow, Tracks
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from tests.plants_over_days import grow_blades, grown, see, write_result
@@ -37,7 +37,7 @@ def test_pictures_follow_the_stored_rows(tmp_path: Path, orientation: int) -> No
     photo = np.zeros((40, 40, 3), np.uint8)
     photo[:, :20, 0], photo[:, 20:, 2] = 255, 255  # leaf 1 is red, leaf 2 is blue
     Image.fromarray(photo).save(tmp_path / "000.png", exif=exif)
-    pictures = picture_leaves(load_result(tmp_path / "a"), [1, 2])
+    pictures, _ = draw_pictures(load_result(tmp_path / "a"), [1, 2], side=72)
     middles = [np.asarray(Image.open(BytesIO(pictures[leaf].jpeg)))[36, 36] for leaf in (1, 2)]
     assert [int(middle.argmax()) for middle in middles] == [0, 2]
     assert [leaf_at(tmp_path / "a", picture.view, *picture.at) for _, picture in sorted(pictures.items())] == [1, 2]

@@ -32,6 +32,7 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
     edits = dump_edits(made)
     name = json.dumps([result.scene.name, run.get("inputs"), run.get("code"), edits], default=str)
     lenses, of_view = describe_lenses(result.scene)
+    views = zip(result.scene.cameras.sizes.tolist(), of_view, strict=True)
     return {
         "key": hashlib.sha256(name.encode()).hexdigest()[:16],
         "edits": edits,
@@ -40,10 +41,7 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
         "outcomes": [describe_fate(fate) for fate in result.fates],
         "lenses": lenses,
         "angles": measure_angles(result).tolist(),
-        "views": [
-            {"size": size, "lens": lens}
-            for size, lens in zip(result.scene.cameras.sizes.tolist(), of_view, strict=True)
-        ],
+        "views": [{"size": size, "lens": lens} for size, lens in views],
         "doubts": describe_questions(result, pictures),
     }
 
@@ -69,41 +67,32 @@ def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None
     A grid has its numbers of columns and rows, from edge to edge of the photo, and x and y of the moves, pixels, row by
     row; 0 where the photo shows nothing.
     """
-    lens_of: dict[tuple[Any, ...], int] = {}
-    lenses: list[dict[str, Any]] = []
+    grids: dict[tuple[Any, ...], dict[str, Any]] = {}
     of_view: list[int | None] = []
-    for index, view in enumerate(scene.views):
+    for view, size, K in zip(scene.views, scene.cameras.sizes.tolist(), scene.cameras.K.cpu().numpy(), strict=True):
         if view.lens is None:
             of_view.append(None)
             continue
-        (width, height), K = scene.cameras.sizes[index].tolist(), scene.cameras.K[index].cpu().numpy()
-        name = (view.lens.model_name, *view.lens.params, *K.ravel().tolist(), width, height)
-        if name not in lens_of:
-            lens_of[name] = len(lenses)
+        name, (width, height) = (view.lens.model_name, *view.lens.params, *K.ravel().tolist(), *size), size
+        if name not in grids:
             rows = max(2, round(COLUMNS * height / width))
             x, y = np.meshgrid(np.linspace(0, width, COLUMNS), np.linspace(0, height, rows))
             points = np.stack((x.ravel(), y.ravel()), 1)
             moves = np.nan_to_num(photo_from_pinhole(view.lens, K, points) - points, nan=0, posinf=0, neginf=0)
-            lenses.append({"columns": COLUMNS, "rows": rows, "moves": np.round(moves, 2).ravel().tolist()})
-        of_view.append(lens_of[name])
-    return lenses, of_view
+            grids[name] = {"columns": COLUMNS, "rows": rows, "moves": np.round(moves, 2).ravel().tolist()}
+        of_view.append([*grids].index(name))
+    return [*grids.values()], of_view
 
 
 def describe_questions(result: Result, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
     """The queue; outlines in units of the pictures."""
     cameras = result.scene.cameras.to("cpu")
     photos = result.photos if result.photos is not None and result.photos.exist else None
-    return [
-        _describe_question(question, pictures, cameras.sizes.tolist())
-        for question in list_mask_questions(
-            result.masks, result.surfaces, cameras=cameras, rejected=result.rejected, photos=photos
-        )
-    ]
+    asked = list_mask_questions(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected, photos=photos)
+    return [_describe_question(each, pictures, cameras.sizes.tolist()) for each in asked]
 
 
-def _describe_question(
-    question: MaskQuestion, pictures: Sequence[Picture], sizes: Sequence[Sequence[int]]
-) -> dict[str, Any]:
+def _describe_question(question: MaskQuestion, pictures: Sequence[Picture], sizes: list[list[int]]) -> dict[str, Any]:
     outlines = []
     for view, outline in question.outlines:
         size = sizes[view]

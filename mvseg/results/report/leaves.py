@@ -1,13 +1,17 @@
-"""The numbers of the leaves and of the plant on the page."""
+"""The leaves, the stems and the plant on the page: their numbers, and lines of stems in the photos."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+import numpy as np
+
 from mvseg.formats.text_file import short_number
 from mvseg.results.overlay import instance_color
+from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
+from mvseg.results.stem_shapes import parts_of
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.measure import Traits
 from mvseg.traits.ontology import (
@@ -55,15 +59,13 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
 
 def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Definition]) -> dict[str, Any]:
     """{trait: its value, standard deviation (None without one), and shape}; missing ones only have a reason."""
-    described: dict[str, Any] = {}
-    for trait in traits:
-        number = numbers[trait.name]
+
+    def describe(number: Measurement) -> dict[str, Any]:
         if not number.exists:
-            described[trait.name] = {"why": number.method}
-            continue
-        value, sd = short_number(number.value), short_number(number.sd)
-        described[trait.name] = {"value": value, "sd": sd, "on": number.method}
-    return described
+            return {"why": number.method}
+        return {"value": short_number(number.value), "sd": short_number(number.sd), "on": number.method}
+
+    return {trait.name: describe(numbers[trait.name]) for trait in traits}
 
 
 def describe_traits(traits: Traits | None) -> dict[str, Any]:
@@ -84,3 +86,36 @@ def _describe_trait(trait: Definition, unit: str) -> dict[str, Any]:
     written = UNITLESS.get(trait.kind, unit_of(trait.kind, unit)).replace("^2", "²").replace("^3", "³")
     label = LABELS.get(trait.name, trait.name.replace("_", " "))
     return {"name": trait.name, "label": label, "unit": written, "meaning": trait.meaning, "hasSd": trait.has_sd}
+
+
+def draw_lines(result: Result, view: int, picture: Picture) -> list[dict[str, Any]]:
+    """Stems and petioles in one photo: paths of SVG in the units of its picture, and the leaf of a petiole."""
+    width, height = result.scene.cameras.sizes[view].tolist()
+    px_from_world = result.scene.cameras.px_from_world[view].cpu().numpy()
+    corner = np.array(picture.box[:2]) * (width, height)
+    scale = UNITS / ((picture.box[2] - picture.box[0]) * width)
+    lines = []
+    for part in parts_of(result):
+        cam = part.points @ px_from_world[:, :3].T + px_from_world[:, 3]
+        if (cam[:, 2] > 0).all():
+            places = np.round((cam[:, :2] / cam[:, 2:] - corner) * scale).astype(int).tolist()
+            path = "M" + "L".join(f"{x} {y}" for x, y in places)
+            line = {"path": path, "isGuessed": part.is_guessed}
+            lines.append(line if part.leaf is None else line | {"leaf": part.leaf})
+    return lines
+
+
+def describe_stems(result: Result) -> list[dict[str, Any]]:
+    """One entry per stem: its source, the phyllotaxis that it suggests, and its nodes, upwards."""
+    stems = []
+    for stem in () if result.traits is None else result.traits.stems:
+        suggested = stem.phyllotaxis
+        nodes = [
+            {"leaf": node.leaf, "node": node.number, "azimuth": short_number(node.node_azimuth.value)}
+            | {"height": short_number(node.height.value), "sd": short_number(node.height.sd)}
+            for node in stem.nodes
+        ]
+        phyllotaxis = {"angle": short_number(suggested.angle), "probability": short_number(suggested.probability)}
+        about = {"number": stem.number, "source": stem.source, "nodes": nodes, "name": suggested.name}
+        stems.append(about | phyllotaxis | {"chance": short_number(stem.probability)})
+    return stems

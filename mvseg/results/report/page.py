@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import html
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from mvseg.results.report.correct import describe_correct, describe_questions
-from mvseg.results.report.leaves import describe_leaves, describe_traits
+from mvseg.results.report.leaves import describe_leaves, describe_stems, describe_traits, draw_lines
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
-from mvseg.results.report.stems import describe_stems, draw_lines
 from mvseg.results.result import Result
 
 ASSETS = files("mvseg.results.report") / "assets"
@@ -57,14 +54,13 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
 def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """All that the page shows, as its script reads it."""
     scene = result.scene
-    pictures_of = zip(scene.views, pictures, describe_masks(result, pictures), strict=True)
     return {
         "plant": scene.name,
         "unit": scene.unit or "world unit",
         "numMasks": len(result.regions),
         "views": [
-            {"name": view.name} | picture.as_json() | {"masks": masks, "stems": draw_lines(result, index, picture)}
-            for index, (view, picture, masks) in enumerate(pictures_of)
+            {"name": view.name} | picture.as_json() | {"stems": draw_lines(result, index, picture)}
+            for index, (view, picture) in enumerate(zip(scene.views, pictures, strict=True))
         ],
         "leaves": describe_leaves(result),
         "stems": describe_stems(result),
@@ -76,21 +72,11 @@ def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[s
     }
 
 
-def describe_masks(result: Result, pictures: Sequence[Picture]) -> list[list[dict[str, Any]]]:
-    """The outlined masks of each view."""
-    described = [[asdict(outline) for outline in picture.outlines] for picture in pictures]
-    scores = result.masks.detection_scores.tolist()
-    for mask in (mask for masks in described for mask in masks):
-        if not math.isnan(scores[mask["region"]]):
-            mask["detection_score"] = round(scores[mask["region"]], 4)
-    return described
-
-
 def describe_update(result: Result, pictures: Sequence[Picture]) -> dict[str, Any]:
     """Data that the mode "Correct" shows anew of a result of the same photos; for `pictures` see
     `Picture.with_masks`."""
     return {
-        "views": [{"masks": masks} for masks in describe_masks(result, pictures)],
+        "views": [{"masks": picture.outlines} for picture in pictures],
         "leaves": describe_leaves(result),
         "doubts": describe_questions(result, pictures),
         "numMasks": len(result.regions),

@@ -25,30 +25,6 @@ TOLERANCE = 1.5  # limit: max. distance of an outline from the edge of its mask,
 LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # limit: units of the height of a number in the picture, at least and at most
 
 
-@dataclass(frozen=True)
-class MaskContour:
-    """One mask, in units of the picture, of which it is 2000 wide.
-
-    Attributes:
-        region: index of the mask.
-        leaf: id of its instance, -1 = matched to nothing.
-        path: SVG path; holes are paths of their own (even-odd rule).
-        box: xyxy, around all of it.
-        at: where its number goes: the middle of the thickest place.
-        height: height of its number.
-        is_sure: whether its `match_score` (see `Matching`) is at least 0.5.
-    """
-
-    region: int
-    leaf: int
-    path: str
-    box: Box
-    at: tuple[int, int]
-    height: int
-    match_score: float
-    is_sure: bool
-
-
 @dataclass(frozen=True, eq=False)
 class Picture:
     """One view.
@@ -58,21 +34,23 @@ class Picture:
         thumbnail: JPEG of the whole photo.
         box: xyxy of that part, in shares of the photo's width and height.
         proportion: its height / width.
+        outlines: of its masks, see `outline_masks`.
     """
 
     jpeg: bytes
     thumbnail: bytes
     box: tuple[float, float, float, float]
     proportion: float
-    outlines: list[MaskContour]
+    outlines: list[dict[str, Any]]
 
     def as_json(self) -> dict[str, Any]:
-        """Data that the page reads, except for the masks; JPEGs in base64."""
+        """Data that the page reads; JPEGs in base64."""
         return {
             "jpeg": base64.b64encode(self.jpeg).decode("ascii"),
             "thumbnail": base64.b64encode(self.thumbnail).decode("ascii"),
             "box": [round(share, 5) for share in self.box],
             "proportion": round(self.proportion, 5),
+            "masks": self.outlines,
         }
 
     def with_masks(self, masks: Masks, *, view: int, size: tuple[int, int]) -> Picture:
@@ -108,9 +86,14 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
     return encode_jpeg(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), quality=QUALITY)
 
 
-def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
-    """The masks of one view, large ones first, so that small ones lie on top; those outside of the shown part of the
-    photo (`box`, xyxy, pixels), too: the user may look for them."""
+def outline_masks(masks: Masks, *, view: int, box: Box) -> list[dict[str, Any]]:
+    """The masks of one view as the page reads them, in units of the picture, of which it is 2000 wide; large ones
+    first, so that small ones lie on top; those outside of the shown part of the photo (`box`, xyxy, pixels), too: the
+    user may look for them.
+
+    The number of a mask goes `at` the middle of its thickest place; holes of its SVG `path` are paths of their own
+    (even-odd rule); it `is_sure` if its `match_score` (see `Matching`) is at least 0.5.
+    """
     regions = masks.regions
     outlines = []
     for region in (each for each in regions.large_first(view) if regions.areas[each]):
@@ -120,19 +103,18 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
         middle, radius = find_thickest(mask)
         x, y = np.round(_place(np.array(middle) + corner + 0.5, box)).astype(int).tolist()
         thickness = 2 * radius * UNITS / (box[2] - box[0])
-        score = float(masks.match_scores[region])
-        outlines.append(
-            MaskContour(
-                region=region,
-                leaf=int(masks.instance_ids[region]),
-                path=path,
-                box=around,
-                at=(x, y),
-                height=int(np.clip(thickness, LEAST_HEIGHT, LARGEST_HEIGHT)),
-                match_score=round(score, 4),
-                is_sure=score >= SURE,
-            )
-        )
+        score, detected = float(masks.match_scores[region]), float(masks.detection_scores[region])
+        outline = {
+            "region": region,
+            "leaf": int(masks.instance_ids[region]),
+            "path": path,
+            "box": around,
+            "at": (x, y),
+            "height": int(np.clip(thickness, LEAST_HEIGHT, LARGEST_HEIGHT)),
+            "match_score": round(score, 4),
+            "is_sure": score >= SURE,
+        }
+        outlines.append(outline if math.isnan(detected) else outline | {"detection_score": round(detected, 4)})
     return outlines
 
 

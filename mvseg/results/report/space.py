@@ -18,9 +18,8 @@ from mvseg.formats.mesh import simplify_mesh
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
-from mvseg.results.report.stems import parts_of
 from mvseg.results.result import Result
-from mvseg.results.stem_shapes import StemPart
+from mvseg.results.stem_shapes import StemPart, parts_of
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import level_frame
 
@@ -143,10 +142,8 @@ def _describe_part(part: StemPart, frame: Frame) -> dict[str, Any]:
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:
     steps = np.round(np.clip(points, -1, 1) * STEPS).astype("<i2")
-    return {
-        "points": base64.b64encode(steps.tobytes()).decode("ascii"),
-        "faces": base64.b64encode(np.asarray(mesh.faces).astype("<u2").tobytes()).decode("ascii"),
-    }
+    arrays = {"points": steps, "faces": np.asarray(mesh.faces).astype("<u2")}
+    return {name: base64.b64encode(each.tobytes()).decode("ascii") for name, each in arrays.items()}
 
 
 def _rounded(values: Floats) -> list[float]:

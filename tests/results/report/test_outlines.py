@@ -63,15 +63,15 @@ def test_large_masks_come_first_and_numbers_lie_inside() -> None:
     regions = regions_from_label_maps([labels, labels])
     masks = as_masks(regions, [3, 5, -1, 1, 1, 2, 3, 4])
     found = outline_masks(masks, view=0, box=BOX)
-    said = [(outline.region, outline.leaf) for outline in found]
+    said = [(outline["region"], outline["leaf"]) for outline in found]
     assert said == [(1, 5), (2, -1), (3, 1), (0, 3)]
-    assert found[2].box[2:] < (0, 0)
-    assert [outline.is_sure for outline in found] == [True, True, True, True]
-    assert [outline.is_sure for outline in outline_masks(masks, view=1, box=BOX)][2:] == [False, True]
+    assert found[2]["box"][2:] < (0, 0)
+    assert [outline["is_sure"] for outline in found] == [True, True, True, True]
+    assert [outline["is_sure"] for outline in outline_masks(masks, view=1, box=BOX)][2:] == [False, True]
     for outline, label in zip(found, (2, 3, 4, 1), strict=True):
-        x, y = outline.at
+        x, y = outline["at"]
         assert labels[int(y / 10 + 20), int(x / 10 + 40)] == label
-    assert found[0].height > found[3].height
+    assert found[0]["height"] > found[3]["height"]
 
 
 def test_a_view_without_masks() -> None:

@@ -81,7 +81,7 @@ def test_the_same_result_gives_the_same_page(balls: Result, tmp_path: Path) -> N
 def test_scores_and_ids_are_those_of_the_result(balls: Result) -> None:
     scores = torch.linspace(0.3, 0.9, len(balls.regions))
     found = replace(balls, matching=balls.matching.with_masks(replace(balls.masks, detection_scores=scores)))
-    data = describe_page(found, draw_pictures(balls), run=RUN)
+    data = describe_page(found, draw_pictures(found), run=RUN)
     masks = {mask["region"]: (view, mask) for view, entry in enumerate(data["views"]) for mask in entry["masks"]}
     assert sorted(masks) == list(range(len(balls.regions)))
     for region, (view, mask) in masks.items():

@@ -42,5 +42,5 @@ def test_a_picture_is_the_part_with_the_plant() -> None:
     np.testing.assert_allclose(image[33, 45], (20, 160, 40), atol=12)
     np.testing.assert_allclose(thumbnail[5, 5], (200, 30, 30), atol=12)
     (outline,) = picture.outlines
-    assert outline.leaf == 1
-    assert outline.box[2] - outline.box[0] == pytest.approx(2000 * 79 / 90, abs=2)
+    assert outline["leaf"] == 1
+    assert outline["box"][2] - outline["box"][0] == pytest.approx(2000 * 79 / 90, abs=2)
