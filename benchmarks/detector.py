@@ -50,7 +50,7 @@ from mvseg.masks import Masks
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample
-from mvseg.training.validation import detect_and_label
+from mvseg.training.loop import detect_and_label
 
 MEANS = ("s_match", "e_k", "ari", "all_pair_f1", "mv_pq")  # over the scenes; all else is pooled
 HIDDEN = 0.5  # a leaf is hidden when less than this share of it is visible

@@ -2,9 +2,9 @@
 
 Masks of development plants (`label_maps`, 8 to 32 leaves in 5 and 10 views, true and degraded; and straps, whole, in
 pieces and degraded), as they are, and with all masks but one of a leaf taken away, six leaves of each. What the search
-puts into one cluster of one photo is right where both masks show one leaf. Prints the coefficients of
-`mvseg/matching/nview/pieces.py`, fitted to all, and, with each plant left out in turn, how many right pieces and how
-many strangers are likelier pieces than not.
+puts into one cluster of one photo is right where both masks show one leaf. Prints the coefficients of `match_nview.py`,
+fitted to all, and, with each plant left out in turn, how many right pieces and how many strangers are likelier pieces
+than not.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from benchmarks.label_maps import load_maps, plant_index, visible_ids
 from benchmarks.straps import cut_pieces, strap_cameras
 from mvseg.evaluation.truth import true_instances
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.nview.match_nview import find_clusters
-from mvseg.matching.nview.pieces import PIECE, piece_features
+from mvseg.matching.nview.match_nview import PIECE, find_clusters, piece_features
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras

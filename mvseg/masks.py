@@ -6,7 +6,7 @@ A stage takes `Masks` and gives `Masks` back; nothing about a mask is kept anywh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
 
@@ -19,15 +19,6 @@ from mvseg.regions import Regions, stack_regions
 
 STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
 SURE = 0.5  # definition: match score, or q, from which a mask likelier shows an instance than not
-COLUMNS = (  # that are tensors
-    "instance_ids",
-    "match_scores",
-    "detection_scores",
-    "classes",
-    "origin",
-    "is_linked",
-    "proposal",
-)
 
 
 class Origin(IntEnum):
@@ -128,26 +119,6 @@ class Masks:
         columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in COLUMNS}
         return replace(self, regions=self.regions.select(index), **columns)
 
-    def relabel(self, numbers: Tensor) -> Masks:
-        """Instance k gets the id `numbers[k - 1]`.
-
-        Args:
-            numbers: (K,) int64: 1, 2, ... in any order, each once, and -1 for every instance to discard: its masks
-                become unmatched.
-
-        Raises:
-            InputError: any other numbers.
-        """
-        num_left = int((numbers > 0).sum())
-        if sorted(numbers.tolist()) != [-1] * (len(numbers) - num_left) + list(range(1, num_left + 1)):
-            raise InputError(f"instances get the numbers {numbers.tolist()}, expected 1, 2, ... once each, or -1")
-        if len(numbers) < self.num_instances:
-            raise InputError(f"{self.num_instances} instances get {len(numbers)} numbers, expected one each")
-        lookup = torch.nn.functional.pad(numbers.to(self.instance_ids), (0, 1), value=-1)
-
-        ids = lookup[torch.where(self.instance_ids > 0, self.instance_ids - 1, len(numbers))]
-        return replace(self, instance_ids=ids, match_scores=self.match_scores * (ids > 0))
-
     @staticmethod
     def concatenate(parts: Sequence[Masks]) -> Masks:
         """The rows of one or more tables of the same views, one after another.
@@ -159,12 +130,8 @@ class Masks:
             ids = torch.where(part.instance_ids > 0, part.instance_ids + largest, -1)
             shifted.append(replace(part, instance_ids=ids))
             largest += part.num_instances
-
-        def join(tables: Sequence[Any], names: Sequence[str]) -> dict[str, Any]:
-            return {name: torch.cat([getattr(each, name) for each in tables]) for name in names}
-
-        joined = join([part.regions for part in parts], ("view_index", "boxes", "crops", "labels"))
-        return Masks(replace(parts[0].regions, **joined), **join(shifted, COLUMNS))
+        columns: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in shifted]) for name in COLUMNS}
+        return Masks(Regions.concatenate([part.regions for part in parts]), **columns)
 
     def count_sure_views(self) -> Tensor:
         """(K,) int64: in how many views a mask of each instance has a match score of at least 0.5."""
@@ -172,6 +139,9 @@ class Masks:
         seen = torch.zeros(self.num_instances, self.regions.num_views, dtype=torch.int64, device=self.view_index.device)
         seen[self.instance_ids[is_sure] - 1, self.view_index[is_sure]] = 1
         return seen.sum(1)
+
+
+COLUMNS = tuple(each.name for each in fields(Masks) if each.name != "regions")
 
 
 def replace_crops(masks: Masks, crops: Sequence[Crop]) -> Masks:

@@ -7,16 +7,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
 
-from mvseg.crop import Crop
+from mvseg.crop import Box, Crop
 from mvseg.errors import InputError
 
-BAND = 256  # limit: rows of a label map that are looked at together
+REGION_COLUMNS = ("view_index", "boxes", "crops", "labels")
 IGNORE_LABEL = 65535  # definition: in label maps: pixels that belong to no region and are left out of every score
 
 
@@ -50,10 +51,8 @@ class Regions:
     def __post_init__(self) -> None:
         num_regions = len(self.view_index)
         if tuple(self.boxes.shape) != (num_regions, 4) or tuple(self.labels.shape) != (num_regions,):
-            raise InputError(
-                f"{num_regions} regions with boxes {tuple(self.boxes.shape)} and labels {tuple(self.labels.shape)}, "
-                f"expected ({num_regions}, 4) and ({num_regions},)"
-            )
+            given = f"boxes {tuple(self.boxes.shape)} and labels {tuple(self.labels.shape)}"
+            raise InputError(f"{num_regions} regions with {given}, expected ({num_regions}, 4) and ({num_regions},)")
         if num_regions and int(self.crop_sizes.min()) < 1:
             raise InputError(f"region {int(self.crop_sizes.min(1)[0].argmin())} has an empty box")
         if self.crops.dtype != torch.bool or len(self.crops) != int(self.crop_sizes.prod(1).sum()):
@@ -69,10 +68,7 @@ class Regions:
         return self.boxes.device
 
     def to(self, device: torch.device | str) -> Regions:
-        view_index, boxes, crops, labels = (
-            field.to(device) for field in (self.view_index, self.boxes, self.crops, self.labels)
-        )
-        return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
+        return replace(self, **{name: getattr(self, name).to(device) for name in REGION_COLUMNS})
 
     @property
     def crop_sizes(self) -> Tensor:
@@ -147,6 +143,13 @@ class Regions:
         crops = torch.cat([self.crops[start:end] for start, end in ends]) if len(keep) else self.crops[:0]
         view_index, boxes, labels = self.view_index[keep], self.boxes[keep], self.labels[keep]
         return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
+
+    @staticmethod
+    def concatenate(parts: Sequence[Regions]) -> Regions:
+        """The regions of one or more tables of the same views, one after another."""
+        names = REGION_COLUMNS
+        columns: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in parts]) for name in names}
+        return replace(parts[0], **columns)
 
     def of_views(self, views: Tensor) -> Regions:
         """The regions of the views at (S,) int64, each named once, as those of views 0 to S - 1; by view."""
@@ -263,18 +266,18 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Region
     Raises:
         InputError: something else than such an array.
     """
-    view_index, boxes, crops, labels, num_views = [], [], [], [], 0
+    rows: list[tuple[int, Box, Tensor, int]] = []
+    num_views = 0
     for view, given in enumerate(label_maps):
         label_map: object = given.detach().cpu().numpy() if isinstance(given, Tensor) else given
         if not isinstance(label_map, np.ndarray) or label_map.ndim != 2 or label_map.dtype.kind not in "uib":
             kind = f"{type(label_map).__name__} {getattr(label_map, 'shape', '')} {getattr(label_map, 'dtype', '')}"
             raise InputError(f"view {view}: the label map is a {kind.strip()}, expected an integer array (H, W)")
         num_views = view + 1
-        for number, (x1, y1, x2, y2) in sorted(label_boxes(label_map).items()):
-            view_index.append(view)
-            boxes.append((x1, y1, x2, y2))
-            crops.append(torch.from_numpy(label_map[y1:y2, x1:x2] == number).flatten())
-            labels.append(number)
+        for number, box in label_boxes(label_map).items():
+            x1, y1, x2, y2 = box
+            rows.append((view, box, torch.from_numpy(label_map[y1:y2, x1:x2] == number).flatten(), number))
+    view_index, boxes, crops, labels = zip(*rows, strict=True) if rows else ((), (), (), ())
     return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
 
 
@@ -283,43 +286,22 @@ def _slices(box: np.ndarray) -> tuple[slice, slice]:
     return slice(y1, y2), slice(x1, x2)
 
 
-def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:
-    """{number: x1, y1, x2, y2 (half-open)} of an integer label map (H, W), without 0 and 65535. `BAND` rows are looked
-    at together, since this needs arrays that are several times as large."""
-    boxes: dict[int, tuple[int, int, int, int]] = {}
-    for top in range(0, len(label_map), BAND):
-        band = np.asarray(label_map[top : top + BAND])
-        columns = np.flatnonzero(band.any(0))
-        if not len(columns):
-            continue
-        left = int(columns[0])
-        numbers, dense = _number_densely(band[:, left : columns[-1] + 1])
-        for number, (down, along) in zip(numbers.tolist(), ndimage.find_objects(dense), strict=True):
-            if number in (0, IGNORE_LABEL):
-                continue
-            box = (left + along.start, top + down.start, left + along.stop, top + down.stop)
-            x1, y1, x2, y2 = boxes.get(number, box)
-            boxes[number] = (min(x1, box[0]), min(y1, box[1]), max(x2, box[2]), max(y2, box[3]))
+def label_boxes(label_map: np.ndarray) -> dict[int, Box]:
+    """{number: x1, y1, x2, y2 (half-open)} of an integer label map (H, W), without 0 and 65535; ascending."""
+    numbers: Iterable[int] = range(1, IGNORE_LABEL)
+    dense = label_map.view(np.uint8) if label_map.dtype == bool else label_map
+    if dense.min(initial=0) < 0 or dense.max(initial=0) > IGNORE_LABEL:
+        distinct, inverse = np.unique(dense, return_inverse=True)
+        numbers, dense = distinct.tolist(), inverse.reshape(dense.shape) + 1
+    boxes = {}
+    for number, place in zip(numbers, ndimage.find_objects(dense, max(1, int(dense.max(initial=0)))), strict=False):
+        if place is not None and number not in (0, IGNORE_LABEL):
+            boxes[number] = (place[1].start, place[0].start, place[1].stop, place[0].stop)
     return boxes
 
 
-def _number_densely(band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    highest = int(band.max())
-    if band.dtype.kind in "iu" and band.min() >= 0 and highest <= np.iinfo(np.uint16).max:  # looked up, not sorted
-        occurs = np.zeros(highest + 1, bool)
-        occurs[band] = True
-        return np.flatnonzero(occurs), occurs.cumsum(dtype=np.int32)[band]
-    numbers, dense = np.unique(band, return_inverse=True)
-    return numbers, dense.reshape(band.shape) + 1
-
-
 def stack_regions(
-    view_index: Sequence[int],
-    boxes: Sequence[tuple[int, int, int, int]],
-    crops: Sequence[Tensor],
-    *,
-    labels: Sequence[int],
-    num_views: int,
+    view_index: Sequence[int], boxes: Sequence[Box], crops: Sequence[Tensor], *, labels: Sequence[int], num_views: int
 ) -> Regions:
     """Regions from one entry per region: see `Regions`; `crops` are flat bool tensors. All sequences may be empty."""
     return Regions(

@@ -77,8 +77,7 @@ class Cameras:
                 raise InputError(f"{field} has shape {tuple(value.shape)}, expected {(num_views, *shape)}")
             object.__setattr__(self, field, value.to(torch.int64 if field == "sizes" else torch.float64))
         for index in range(num_views):
-            problem = camera_problem(self.K[index], self.R[index], self.t[index], size=self.sizes[index])
-            if problem:
+            if problem := camera_problem(self.K[index], self.R[index], self.t[index], size=self.sizes[index]):
                 raise InputError(f"view {index}: {problem}")
 
     def __len__(self) -> int:
@@ -119,11 +118,6 @@ class Cameras:
         """Unit of measures that depend on drawn masks, in pixels: a 700th of the photos' diagonal, at least one pixel.
         Masks and features of large photos are less exact."""
         return max(1.0, float(self.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
-
-    def nearest_point(self, views: Tensor, directions: Tensor) -> Tensor:
-        """(3,) the world point nearest to N rays in the least squares; of parallel rays, one of many. Each starts at
-        the camera of `views` (N,) int64; `directions` (N, 3) in world axes are of any length."""
-        return nearest_point(self.centers[views], directions)
 
     def scale(self, factor: float) -> Cameras:
         """The same cameras in a world whose lengths are multiplied by `factor` > 0; every point keeps its pixel."""
@@ -228,11 +222,10 @@ class Scene:
             object.__setattr__(self, "up", (x / length, y / length, z / length))
         if len(self.views) != len(self.cameras):
             raise InputError(f"{len(self.views)} views with {len(self.cameras)} cameras, expected one per view")
-        first_with: dict[str, int] = {}
-        for index, view in enumerate(self.views):
-            if view.name in first_with:
-                raise InputError(f"views {first_with[view.name]} and {index} have the same name '{view.name}'")
-            first_with[view.name] = index
+        names = [view.name for view in self.views]
+        for index, name in enumerate(names):
+            if (first := names.index(name)) < index:
+                raise InputError(f"views {first} and {index} have the same name '{name}'")
 
     def select(self, index: Tensor) -> Scene:
         """The scene with the views at (S,) int64, in that order."""

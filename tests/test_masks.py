@@ -49,27 +49,6 @@ def test_a_permutation_and_its_inverse_are_nothing() -> None:
     assert same(table().select(order).select(order.argsort()), table())
 
 
-def test_relabelling_and_its_inverse_are_nothing() -> None:
-    after = table().relabel(torch.tensor([3, 1, 2]))
-    assert after.instance_ids.tolist() == [1, 3, 1, -1, 2]
-    assert same(after.relabel(torch.tensor([2, 3, 1])), table())
-
-
-def test_a_discarded_instance_leaves_nothing_behind() -> None:
-    after = table().relabel(torch.tensor([2, 1, -1]))
-    assert after.instance_ids.tolist() == [1, 2, 1, -1, -1]
-    assert after.match_scores.tolist() == pytest.approx([0.9, 0.8, 0.4, 0, 0])
-    assert after.num_instances == 2
-
-
-@pytest.mark.parametrize("numbers", [[1, 1, 2], [0, 1, 2], [2, 3, 4]])
-def test_other_numbers_are_refused(numbers: list[int]) -> None:
-    with pytest.raises(InputError, match="instances get the numbers"):
-        table().relabel(torch.tensor(numbers))
-    with pytest.raises(InputError, match="3 instances get 2 numbers"):
-        table().relabel(torch.tensor([1, 2]))
-
-
 def test_concatenated_tables_share_no_instance() -> None:
     joined = Masks.concatenate([table(), table()])
     assert joined.instance_ids.tolist() == [2, 1, 2, -1, 3, 5, 4, 5, -1, 6]

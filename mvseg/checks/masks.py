@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvseg.checks.numbers import IMAGES
 from mvseg.findings.finding import Finding, Rule, list_findings
-from mvseg.formats.masks.faults import mask_faults
+from mvseg.formats.masks.view_regions import mask_faults
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 

@@ -12,8 +12,7 @@ from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
-from mvseg.formats.photo_content import PhotoContent, measure_content
-from mvseg.formats.photos import Photos, photo_bits, photos_in
+from mvseg.formats.photos import PhotoContent, Photos, measure_content, photo_bits, photos_in
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 

@@ -13,7 +13,7 @@ from mvseg.corrections.numbers import QUESTIONS
 from mvseg.corrections.rough_outline import trace_outline
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
-from mvseg.verification.picture import FREE, Labels, label_views
+from mvseg.verification.picture import FREE, Labels, picture_views
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
     of the photo, the widest place counts: several leaves hang together there, or the ground."""
     if not masks.num_instances:
         return []
-    pictures = enumerate(label_views(masks, photos))
+    pictures = enumerate(picture_views(masks, photos))
     return [part for view, (rows, step) in pictures for part in _parts(rows, view, step=step, least_area=least_area)]
 
 

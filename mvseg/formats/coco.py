@@ -46,21 +46,16 @@ class CocoAnnotation(BaseModel):
     segments_info: Any = None
 
 
-class CocoFile(BaseModel):
-    """Fields of every COCO file."""
-
-    images: Items[CocoImage]
-    annotations: Items[CocoAnnotation]
-
-
 class _Category(BaseModel):
     id: int | str
     name: str
 
 
-class CocoMasks(CocoFile):
+class CocoFile(BaseModel):
     """Fields that are read; `categories` may be missing."""
 
+    images: Items[CocoImage]
+    annotations: Items[CocoAnnotation]
     categories: Items[_Category] = []
 
 
@@ -148,30 +143,30 @@ def warn_of_crowds(path: Path, count: int, crowd: Crowd, *, option: str) -> None
         warn(Finding(code, str(path), {"count": count, "option": option}))
 
 
-def read_files(parts: Sequence[Path], scene: PhotoSet) -> CocoMasks:
+def read_files(parts: Sequence[Path], scene: PhotoSet) -> CocoFile:
     """The content of a COCO file, or of the parts of one, in any dialect; see `read_coco`."""
     files = [(part, _read_file(part, scene)) for part in parts]
     return _merge(files) if len(files) > 1 else files[0][1]
 
 
-def _read_file(path: Path, scene: PhotoSet) -> CocoMasks:
+def _read_file(path: Path, scene: PhotoSet) -> CocoFile:
     """The file; a list of results gets the images that it refers to."""
     content = load_json(path)
     if not isinstance(content, list):
-        return check_content(path, content, CocoMasks, expected="COCO")
+        return check_content(path, content, CocoFile, expected="COCO")
     results = check_content(path, content, _Results, expected="COCO").root
     listed = _find_data_set(path, results)
     if listed is None:
-        return CocoMasks(images=_guess_images(path, results, scene), annotations=results)
-    return CocoMasks(images=listed.images, annotations=results, categories=listed.categories)
+        return CocoFile(images=_guess_images(path, results, scene), annotations=results)
+    return CocoFile(images=listed.images, annotations=results, categories=listed.categories)
 
 
-def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoMasks | None:
+def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoFile | None:
     """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
     ids, fitting = {str(result.image_id) for result in results}, []
     for other in sorted(path.parent.glob("*.json")):
         try:
-            listed = read_json(other, CocoMasks)
+            listed = read_json(other, CocoFile)
         except InputError:  # no COCO file, which includes the results
             continue
         if ids and ids <= {str(image.id) for image in listed.images}:
@@ -200,9 +195,9 @@ def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) ->
     return [CocoImage(id=each, file_name=name, width=0, height=0) for each, name in zip(ids, names, strict=True)]
 
 
-def _merge(parts: list[tuple[Path, CocoMasks]]) -> CocoMasks:
+def _merge(parts: list[tuple[Path, CocoFile]]) -> CocoFile:
     """Merge several files with independent ids: categories are identified by name, annotations by their place."""
-    merged, part_of = CocoMasks(images=[], annotations=[]), dict[str, Path]()
+    merged, part_of = CocoFile(images=[], annotations=[]), dict[str, Path]()
     for number, (path, part) in enumerate(parts):
         names = {str(category.id): category.name for category in part.categories}
         merged.categories += [_Category(id=name, name=name) for name in names.values()]
@@ -223,8 +218,7 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     """{image id as text: view, or None}, checked."""
     image_ids = {str(image.id) for image in coco.images}
     listed = enumerate(coco.annotations, start=1)
-    orphans = [place if one.id is None else one.id for place, one in listed if str(one.image_id) not in image_ids]
-    if orphans:
+    if orphans := [place if one.id is None else one.id for place, one in listed if str(one.image_id) not in image_ids]:
         warn(Finding("orphans", str(path), {"count": len(orphans), "first": orphans[0]}))
     if len(image_ids) < len(coco.images):
         raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")

@@ -30,8 +30,7 @@ def find_colmap_model(folder: Path) -> Path | None:
         if is_colmap_model(place):
             return place
         models = sorted(filter(is_colmap_model, place.glob("*")), key=lambda path: natural_order(path.name))
-        counts = {model: _count_photos(model) for model in models}
-        if counts:
+        if counts := {model: _count_photos(model) for model in models}:
             best = max(counts, key=counts.__getitem__)
             if len(counts) > 1:
                 shown = tuple(f"{model.name} with {count} photos" for model, count in counts.items())
@@ -74,8 +73,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     scene = build_scene(folder, photos, unit="", source=model)
     registered, images_folder = {view.path for view in scene.views}, folder / "images"
     photos_there = photos_in(images_folder, "**/*")
-    left_out = [path.relative_to(images_folder).as_posix() for path in photos_there if path not in registered]
-    if left_out:
+    if left_out := [path.relative_to(images_folder).as_posix() for path in photos_there if path not in registered]:
         warn(Finding("photos_without_pose", str(model), {"count": len(left_out), "first": left_out[0]}))
     return scene
 
@@ -95,16 +93,10 @@ def _list_names(path: Path) -> Iterator[tuple[int, str]]:
 def _photo(model: Path, image: pycolmap.Image, lens: pycolmap.Camera) -> Photo:
     if not lens.is_perspective():
         raise InputError(f"{model}: image {image.name}: camera model {lens.model_name} is not a perspective one")
-    cam_from_world = image.cam_from_world()
-    return Photo(
-        file=f"images/{image.name}",
-        width=lens.width,
-        height=lens.height,
-        K=np.array(lens.calibration_matrix()),
-        R=np.array(cam_from_world.rotation.matrix()),
-        t=np.array(cam_from_world.translation),
-        lens=None if lens.is_perspective_pinhole() and lens.is_undistorted() else lens,
-    )
+    file, pose, K = f"images/{image.name}", image.cam_from_world(), np.array(lens.calibration_matrix())
+    R, t = np.array(pose.rotation.matrix()), np.array(pose.translation)
+    distorted = None if lens.is_perspective_pinhole() and lens.is_undistorted() else lens
+    return Photo(file=file, width=lens.width, height=lens.height, K=K, R=R, t=t, lens=distorted)
 
 
 def _check_binary_model(model: Path) -> None:

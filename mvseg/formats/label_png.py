@@ -22,20 +22,19 @@ from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.regions import IGNORE_LABEL
 
 MAX_COLOURS = 1000  # limit: more than leaves on a photo; photos and blurred masks have far more
-CHUNK = 1 << 24  # limit: pixels
 VOC_BORDER = 255  # definition: index, in palette PNGs
 VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # definition: of that index
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
     """(height, width) uint16 label map of a view. Raises InputError as `read_labels`, or for another size."""
-    return labels_of(open_labels(path, (width, height)), path)
+    return read_labels(path, (width, height))
 
 
-def read_labels(path: Path) -> np.ndarray:
-    """(H, W) uint16 label map of whatever size. Raises InputError if the file is missing, cannot be decoded, is a JPEG,
-    has colour channels, or does not hold unsigned numbers of at most 16 bits."""
-    return labels_of(open_labels(path), path)
+def read_labels(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+    """(H, W) uint16 label map, of any size unless `size` (width, height) is given. Raises InputError if the file is
+    missing, cannot be decoded, is a JPEG, has colour channels, or does not hold unsigned numbers of at most 16 bits."""
+    return labels_of(open_labels(path, size), path)
 
 
 def open_labels(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
@@ -64,14 +63,7 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
         raise InputError(f"{path}: has {num_channels} colour channels, expected a label PNG with a single channel")
     if image.mode in ("I", "F"):
         raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
-    image = image.convert("L") if image.mode == "1" else image
-    labels = np.zeros((image.height, image.width), np.uint16)
-    num_rows = max(1, CHUNK // image.width)
-    for top in range(0, image.height, num_rows):  # a part at a time, which Pillow copies several times
-        bottom = min(top + num_rows, image.height)
-        part = np.asarray(image.crop((0, top, image.width, bottom)))
-        if part.any():  # pages of zeros that are never written take no memory
-            labels[top:bottom] = part
+    labels = np.asarray(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
     has_numbers = bool(((labels > 0) & (labels < VOC_BORDER)).any())
     if image.mode == "P" and has_numbers and not _clear_background(labels, path):
         labels[labels == VOC_BORDER] = IGNORE_LABEL
@@ -130,11 +122,8 @@ def ignore_border(labels: np.ndarray) -> bool:
         return False
     border = labels == VOC_BORDER
     is_other = (labels > 0) & ~border
-    beside_border, beside_nothing = (
-        np.count_nonzero(is_other & ndimage.binary_dilation(each)) for each in (border, labels == 0)
-    )
-    is_voc = bool(beside_border > beside_nothing)
-    if is_voc:
+    beside = [np.count_nonzero(is_other & ndimage.binary_dilation(each)) for each in (border, labels == 0)]
+    if is_voc := bool(beside[0] > beside[1]):
         labels[border] = IGNORE_LABEL
     return is_voc
 

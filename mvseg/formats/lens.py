@@ -75,13 +75,8 @@ def distort(image: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> n
 
 def _look_up(image: np.ndarray, lens: pycolmap.Camera, K: np.ndarray, *, mapping: Mapping) -> np.ndarray:
     """The image at the positions that a mapping gives; outside of it, 0."""
-    columns, rows = _positions(
-        model=lens.model_name,
-        params=tuple(lens.params),
-        K=tuple(map(float, K.ravel())),
-        size=(image.shape[1], image.shape[0]),
-        mapping=mapping,
-    )
+    params, flat, size = tuple(lens.params), tuple(map(float, K.ravel())), (image.shape[1], image.shape[0])
+    columns, rows = _positions(model=lens.model_name, params=params, K=flat, size=size, mapping=mapping)
     interpolation = cv2.INTER_NEAREST if image.ndim == 2 else cv2.INTER_LINEAR
     return np.asarray(cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
 

@@ -32,9 +32,8 @@ def fit_grid(photo: NDArray[np.uint8], quad: Floats, is_white: NDArray[np.bool_]
     """
     square = len(is_white) * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     for _ in range(PASSES):
-        px_from_grid: Floats = np.asarray(
-            cv2.getPerspectiveTransform(square.astype(np.float32), quad.astype(np.float32)), np.float64
-        )
+        homography = cv2.getPerspectiveTransform(square.astype(np.float32), quad.astype(np.float32))
+        px_from_grid: Floats = np.asarray(homography, np.float64)
         axes = [_find_edges(photo, px_from_grid, white, axis) for axis, white in enumerate((is_white, is_white.T))]
         rows, places, is_outer = (np.concatenate(each) for each in zip(*axes, strict=True))
         shift = np.linalg.lstsq(rows, places, rcond=None)[0][8]

@@ -37,11 +37,9 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *,
     """Write one mesh as binary PLY with normals, in world coordinates; every vertex has the RGB colour (0 to 255), and
     the id as its property `instance_id`."""
     vertices = np.zeros(len(mesh.vertices), [(name, kind) for name, kind, _ in VERTEX])
-    for names, columns in (("xyz", mesh.vertices), (("nx", "ny", "nz"), mesh.vertex_normals)):
-        for name, column in zip(names, columns.T, strict=True):
-            vertices[name] = column
-    for name, value in zip(("red", "green", "blue", "alpha", "instance_id"), (*color, 255, instance_id), strict=True):
-        vertices[name] = value
+    columns = (*mesh.vertices.T, *mesh.vertex_normals.T, *color, 255, instance_id)
+    for (name, *_), column in zip(VERTEX, columns, strict=True):
+        vertices[name] = column
     faces = np.zeros(len(mesh.faces), [("count", "u1"), ("corners", "<i4", 3)])
     faces["count"], faces["corners"] = 3, mesh.faces
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices)}"]
@@ -77,32 +75,17 @@ def write_glb(
     root[:3, 3] += root[:3, :3] @ middle
     scene.graph.update(frame_from=scene.graph.base_frame, frame_to=ROOT, matrix=root, metadata=dict(about or {}))
     for name, mesh in meshes.items():
+        share = np.array(colors[name]) / 255
+        light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+        linear = [round(float(255 * value)) for value in light]  # trimesh keeps no fractions
         material = trimesh.visual.material.PBRMaterial(
-            name=name,
-            baseColorFactor=[*_linear(colors[name]), 255],
-            metallicFactor=0.0,
-            roughnessFactor=0.8,
-            doubleSided=True,
+            name=name, baseColorFactor=[*linear, 255], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
         )
         visual = trimesh.visual.TextureVisuals(material=material)
-        normals = _unit_normals(mesh)
+        normals = np.array(mesh.vertex_normals)  # of length 0 where two sides touch: glTF allows unit vectors only
+        normals[np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-3] = (0, 0, 1)
         near = mesh.vertices - middle
         painted = trimesh.Trimesh(near, mesh.faces, vertex_normals=normals, visual=visual, process=False)
         said = dict((extras or {}).get(name, {}))
         scene.add_geometry(painted, node_name=name, geom_name=name, parent_node_name=ROOT, metadata=said)
     path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))
-
-
-def _unit_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(P, 3) normals of the vertices; +z where two sides touch and there is none: glTF allows unit vectors only."""
-    normals = np.array(mesh.vertex_normals)
-    has_none = np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-3
-    normals[has_none] = (0, 0, 1)
-    return normals
-
-
-def _linear(color: tuple[int, int, int]) -> list[int]:
-    """Linear light of an sRGB colour, 0 to 255 (trimesh keeps no fractions)."""
-    share = np.array(color) / 255
-    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
-    return [round(float(255 * value)) for value in light]

@@ -72,8 +72,7 @@ _Loader.add_multi_constructor(
 def read_calibration(folder: Path, file: str) -> Calibration:
     """Read a calibration file; its path is relative to the scene's folder. Raises InputError, which names the file, if
     it leads out of the scene, cannot be read, or holds no camera matrix, or a distortion that is not supported."""
-    problem = file_name_problem(file)
-    if problem:
+    if problem := file_name_problem(file):
         raise InputError(f"{file}: {problem}")
     path = folder / file
     entries = read_yaml(path, EXPECTED, loader=_Loader)
@@ -113,6 +112,4 @@ def read_calibration(folder: Path, file: str) -> Calibration:
         raise InputError(f"{path}: has {len(distortion)} distortion coefficients, expected 4, 5 or 8")
     if is_fisheye and len(distortion) != 4:
         raise InputError(f"{path}: a fisheye with {len(distortion)} coefficients, expected k1, k2, k3, k4")
-    return Calibration(
-        K=K, distortion=tuple(distortion), is_fisheye=is_fisheye, width=content.width, height=content.height
-    )
+    return Calibration(K, tuple(distortion), is_fisheye=is_fisheye, width=content.width, height=content.height)

@@ -20,19 +20,21 @@ from mvseg.formats.image_file import (
     PHOTO_SUFFIXES,
     WrongSize,
     file_name_problem,
+    is_grey,
     is_turned,
     read_image_size,
     read_rgb,
     sensor_bits,
 )
 from mvseg.formats.lens import undistort
-from mvseg.formats.photo_content import PhotoContent, measure_content
 from mvseg.scene import Cameras, Scene, View, camera_problem
 from mvseg.system.file_hash import hash_files
 
 ReadPhoto = Callable[[int], NDArray[np.uint8]]  # view index -> (H, W, 3) RGB, undistorted: `Photos`, or a stand-in
 
 CACHED_BYTES = 256 * 2**20  # limit: 12 photos of 7 megapixels
+STEP = 4  # limit: every fourth row and column is used
+WHITE = 250  # chosen: a pixel is white if all of its channels reach this value
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +74,7 @@ def build_scene(
     files = [find_photo(folder, photo.file) for photo in photos]
     moved = []
     for index, (photo, file) in enumerate(zip(photos, files, strict=True)):
-        problem = _problem(photo, file)
-        if problem:
+        if problem := _problem(photo, file):
             raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
         if posixpath.dirname(posixpath.normpath(photo.file)) != posixpath.dirname(posixpath.normpath(file)):
             moved.append(f"{file} for {photo.file}")
@@ -81,12 +82,8 @@ def build_scene(
         warn(Finding("photos_by_name", str(source), {"count": len(moved), "first": moved[0]}))
     named = zip(view_names(files), files, photos, strict=True)
     views = tuple(View(name, folder / file, photo.lens) for name, file, photo in named)
-    cameras = Cameras(
-        K=torch.from_numpy(np.stack([photo.K for photo in photos])),
-        R=torch.from_numpy(np.stack([photo.R for photo in photos])),
-        t=torch.from_numpy(np.stack([photo.t for photo in photos])),
-        sizes=torch.tensor([[photo.width, photo.height] for photo in photos]),
-    )
+    K, R, t = (torch.from_numpy(np.stack([getattr(photo, name) for photo in photos])) for name in ("K", "R", "t"))
+    cameras = Cameras(K=K, R=R, t=t, sizes=torch.tensor([[photo.width, photo.height] for photo in photos]))
     with faults_of(source):
         return Scene(name=scene_name(folder), views=views, cameras=cameras, unit=unit, source=source, up=up)
 
@@ -149,8 +146,7 @@ def view_names(files: Sequence[str]) -> list[str]:
 
 
 def _problem(photo: Photo, file: str) -> str | None:
-    problem = file_name_problem(file)
-    if problem:
+    if problem := file_name_problem(file):
         return problem
     if max(photo.width, photo.height, photo.width * photo.height) > MAX_PIXELS:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_PIXELS} pixels in all"
@@ -187,8 +183,7 @@ def check_photos(scene: Scene) -> None:
 
 def warn_of_turned(paths: Sequence[Path]) -> None:
     """Warn (InputWarning) of photos that an orientation tag (EXIF's, or TIFF's) asks viewers to turn."""
-    turned = [path for path in paths if is_turned(path)]
-    if turned:
+    if turned := [path for path in paths if is_turned(path)]:
         warn(Finding("turned_for_display", str(turned[0]), {"count": len(turned)}))
 
 
@@ -227,6 +222,30 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
     """
     photos = [read_photo(scene, view) for view in range(len(scene.views))]
     return [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in photos]
+
+
+@dataclass(frozen=True)
+class PhotoContent:
+    """The numbers of one photo.
+
+    Attributes:
+        contrast: standard deviation of its grey levels.
+        level: grey level that 99 % of the pixels stay below.
+        burnt: share of its pixels that are white.
+    """
+
+    contrast: float
+    level: float
+    burnt: float
+    grey: bool
+
+
+def measure_content(photo: np.ndarray) -> PhotoContent:
+    """Measure a photo (H, W, 3) uint8 as it is stored: without its lens distortion it would have black corners."""
+    pixels = photo[::STEP, ::STEP]
+    levels = pixels.mean(2)
+    level, burnt = float(np.quantile(levels, 0.99)), float((pixels.min(2) >= WHITE).mean())
+    return PhotoContent(contrast=float(levels.std()), level=level, burnt=burnt, grey=is_grey(pixels))
 
 
 class Photos:
@@ -277,9 +296,8 @@ class Photos:
     def select(self, scene: Scene, views: Sequence[int]) -> Photos:
         """Select photos of some views, which `scene` has in this order; what is known of them stays known."""
         chosen, places = Photos(scene), {view: place for place, view in enumerate(views)}
-        chosen._cached = {places[view]: photo for view, photo in self._cached.items() if view in places}
-        chosen._contents = {places[view]: each for view, each in self._contents.items() if view in places}
-        chosen._hashes = {places[view]: each for view, each in self._hashes.items() if view in places}
+        for name in ("_cached", "_contents", "_hashes"):
+            setattr(chosen, name, {places[view]: each for view, each in getattr(self, name).items() if view in places})
         return chosen
 
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -30,22 +29,14 @@ AXIS = re.compile(r"([xyz])(?:[_ ]?[\[(]?(mm|cm|dm|m|um|in|ft)[\])]?)?")
 Rows = Sequence[Mapping[Any, Any]]
 
 
-@dataclass(frozen=True, eq=False)
-class Positions:
-    """Camera positions: `names` of the photos, `xyz` (P, 3) float64, and the `unit` that the file states, or ""."""
-
-    names: tuple[str, ...]
-    xyz: np.ndarray
-    unit: str = ""
-
-
 class _Positions(BaseModel):
     views: Items[dict[str, Any]]
 
 
-def read_positions(path: Path) -> Positions:
-    """Read the camera positions of photos. Raises InputError if the file cannot be read, has no columns for photo, x, y
-    and z, holds other things than numbers there, names a photo twice or has columns in different units."""
+def read_positions(path: Path) -> tuple[list[str], np.ndarray, str]:
+    """Read the camera positions of photos: names of the photos, (P, 3) float64, and the unit that the file states, or
+    "". Raises InputError if the file cannot be read, has no columns for photo, x, y and z, holds other things than
+    numbers there, names a photo twice or has columns in different units."""
     rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else _read_table(path, "positions")
     if not rows:
         raise InputError(f"{path}: holds no positions, expected a line for each photo")
@@ -56,7 +47,7 @@ def read_positions(path: Path) -> Positions:
     if len({unit for _, unit in axes.values()}) > 1:
         raise InputError(f"{path}: x, y and z are in different units, expected one")
     found = _by_photo(path, rows, [keys["photo"], *(axes[axis][0] for axis in "xyz")], what="position")
-    return Positions(names=tuple(found), xyz=np.array(list(found.values())), unit=axes["x"][1])
+    return list(found), np.array(list(found.values())), axes["x"][1]
 
 
 def read_photo_angles(path: Path) -> dict[str, float]:

@@ -93,8 +93,7 @@ def is_scene_folder(folder: Path) -> bool:
 
 def _describe(folder: Path) -> str:
     names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*"))]
-    photos = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
-    if photos:
+    if photos := [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]:
         return f"found {len(photos)} photos ({photos[0]}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
     return f"found {list_some(sorted(path.name for path in folder.iterdir()))}"
 

@@ -102,8 +102,7 @@ def read_transforms(path: Path) -> Scene:
     for index, frame in enumerate(transforms.frames):
         with faults_of(f"{path}: frame {index} ({frame.file_path})"):
             photos.append(_photo(path.parent, frame, _merge(shared, frame.intrinsics), undo=undo))
-    num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
-    if num_masks:
+    if num_masks := sum(frame.mask_path is not None for frame in transforms.frames):
         warn(Finding("mask_paths_not_used", str(path), {"count": num_masks}))
     return build_scene(path.parent, photos, unit="", source=path)
 

@@ -79,9 +79,6 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     )
     num_pixels = [each.sum(1).clamp_(min=1) for each in pixels]
     num_lines = num_pixels if lines is pixels else [each.sum(1).clamp_(min=1) for each in lines]
-    j_from_i, i_from_j = (
-        # shares of pixels in float32: their sums are 1 up to rounding where all of them are inside
-        (inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None])).clamp_(max=1)
-        for side in (0, 1)
-    )
-    return j_from_i, i_from_j
+    # shares of pixels in float32: their sums are 1 up to rounding where all of them are inside
+    shares = [inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None]) for side in (0, 1)]
+    return shares[0].clamp_(max=1), shares[1].clamp_(max=1)

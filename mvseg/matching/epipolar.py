@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mvseg.errors import check_arguments
 from mvseg.matching.numbers import EPIPOLAR
-from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
+from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident
 from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -40,8 +40,8 @@ class Bins:
     low: float
     per_unit: float
     num_bins: int
-    half_line: tuple[int, int]
-    half_pixel: tuple[int, int]
+    half_line: Sequence[int]
+    half_pixel: Sequence[int]
 
     def index(self, angles: Tensor) -> Tensor:
         """(P,) int32 bin of each angle; -1 below the first bin and B above the last."""
@@ -91,11 +91,11 @@ def find_spans(pencil: Pencil, side: int, samples: Samples) -> Spans:
     return Spans(low, high, owner, weight, samples.num_pixels, samples.num_regions)
 
 
-def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> Bins:
+def choose_bins(pitches: Sequence[float], angles: Sequence[Tensor]) -> Bins:
     """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
     A line is a wedge of the pencil, so its thickness varies with the distance to the epipole; it is two pixels on
-    average over the pixels of each image. `pitches` are `mean_pitches` of views i and j; `angles` hold at least the
+    average over the pixels of each image. `pitches` are `Pencil.pitch` of views i and j; `angles` hold at least the
     smallest and the largest angle of the pixels of each. Both views need at least one pixel.
     """
     ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
@@ -103,15 +103,9 @@ def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> 
     per_unit = EPIPOLAR.bins_per_pixel / max(min(pitches), 1e-12)
     num_bins = int(min(max((high - low) * per_unit, EPIPOLAR.min_bins), EPIPOLAR.max_bins))
     per_unit = num_bins / max(high - low, 1e-12) * (1 - 1e-6)
-    half_line = [max(1, min(num_bins, round(EPIPOLAR.line_px / 2 * pitch * per_unit))) for pitch in pitches]
-    half_pixel = [max(1, min(num_bins, ceil(pitch / 2 * per_unit))) for pitch in pitches]
-    return Bins(
-        low=low,
-        per_unit=per_unit,
-        num_bins=num_bins,
-        half_line=(half_line[0], half_line[1]),
-        half_pixel=(half_pixel[0], half_pixel[1]),
-    )
+    line = [max(1, min(num_bins, round(EPIPOLAR.line_px / 2 * pitch * per_unit))) for pitch in pitches]
+    pixel = [max(1, min(num_bins, ceil(pitch / 2 * per_unit))) for pitch in pitches]
+    return Bins(low=low, per_unit=per_unit, num_bins=num_bins, half_line=line, half_pixel=pixel)
 
 
 def span_histogram(bins: Bins, spans: Spans) -> Tensor:
@@ -154,10 +148,7 @@ class BinnedPair:
 
 
 def binned_pairs(
-    samples: Sequence[Samples],
-    cameras: Cameras,
-    *,
-    senders: Sequence[Samples] | None = None,
+    samples: Sequence[Samples], cameras: Cameras, *, senders: Sequence[Samples] | None = None
 ) -> Iterator[BinnedPair]:
     """All pairs of views i < j that both have pixels, with a baseline between them. `samples` and `senders`, the pixels
     that send out lines (None: all), have an entry per view."""
@@ -165,34 +156,17 @@ def binned_pairs(
     occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
     pencils = epipolar_pencils(cameras, pairs)
-    every_pair = zip(pairs, pencils, _pair_pitches(samples, pairs, pencils), strict=True)
-    for (i, j), pencil, pitches in progress_bar(every_pair, "comparing outlines", len(pairs), unit="pair"):
+    thinned = {view: _thin(samples[view]) for view in occupied}
+    every_pair = zip(pairs, pencils, strict=True)
+    for (i, j), pencil in progress_bar(every_pair, "comparing outlines", len(pairs), unit="pair"):
         spans = find_spans(pencil, 0, samples[i]), find_spans(pencil, 1, samples[j])
-        ends = tuple(torch.stack((part.low.min(), part.high.max())) for part in spans)
-        bins = choose_bins(pitches, (ends[0], ends[1]))
-        pixels = span_histogram(bins, spans[0]), span_histogram(bins, spans[1])
-        lines = pixels
+        pitches = pencil.pitch(0, thinned[i]), pencil.pitch(1, thinned[j])
+        bins = choose_bins(pitches, [torch.stack((part.low.min(), part.high.max())) for part in spans])
+        lines = pixels = span_histogram(bins, spans[0]), span_histogram(bins, spans[1])
         if senders is not None:
-            first, second = (
-                span_histogram(bins, find_spans(pencil, side, senders[view])) for side, view in enumerate((i, j))
-            )
-            lines = first, second
+            sent = find_spans(pencil, 0, senders[i]), find_spans(pencil, 1, senders[j])
+            lines = span_histogram(bins, sent[0]), span_histogram(bins, sent[1])
         yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, pixels=pixels, lines=lines)
-
-
-def _pair_pitches(
-    samples: Sequence[Samples], pairs: Sequence[tuple[int, int]], pencils: Sequence[Pencil]
-) -> list[tuple[float, float]]:
-    """The pitch of each pair of views in its first and in its second view."""
-    pitches = [[0.0, 0.0] for _ in pairs]
-    for view, sample in enumerate(samples):
-        sides = [(index, pair.index(view)) for index, pair in enumerate(pairs) if view in pair]
-        if not sides:
-            continue
-        planes = torch.stack([pencils[index].plane_from_px[side] for index, side in sides])
-        for (index, side), pitch in zip(sides, mean_pitches(planes, _thin(sample)), strict=True):
-            pitches[index][side] = pitch
-    return [(first, second) for first, second in pitches]
 
 
 def _thin(samples: Samples) -> Tensor:
@@ -200,8 +174,7 @@ def _thin(samples: Samples) -> Tensor:
     if step < 2:
         return samples.pixels().xy
     xy = samples.pixels(samples.xy[:, 1].int() % step == 0).xy
-    column, row = (each.int() for each in xy.unbind(1))
-    on_lattice = (column % step == 0) & (row % step == 0)
+    on_lattice = xy[:, 0].int() % step == 0
     return xy[on_lattice] if on_lattice.any() else samples.pixels().xy
 
 
@@ -215,12 +188,10 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
     """Test which pixels `xy` (P, 2) float32 of a view lie in the epipolar band of which of D regions (Eq. 2): (D, P)
     bool. Regions of `view` itself, and of views that share its camera centre, have no band there."""
     bands = torch.zeros(len(regions), len(xy), dtype=torch.bool, device=regions.device)
-    if not len(xy):
-        return bands
     cameras = cameras.to(regions.device)
     skip = is_coincident(cameras)[view]
     for other, (source, members) in enumerate(zip(*view_samples(regions), strict=True)):
-        if skip[other] or not len(members):
+        if skip[other] or not len(members) or not len(xy):
             continue
         pencil = epipolar_pencil(cameras, other, view)
         spans, angles = find_spans(pencil, 0, source), pencil.angles(1, xy)

@@ -110,16 +110,10 @@ def match_masks(
     """
     parts, rows = [], []
     for label in masks.classes.unique().tolist() or [1]:
-        members = (masks.classes == label).nonzero()[:, 0]
-        part = _match(
-            masks.regions.select(members),
-            cameras,
-            replace(config, num_instances=num_instances.get(label) or config.num_instances),
-            residual_px=residual_px,
-            links=links.select(members),
-        )
-        parts.append(part)
-        rows.append(members)
+        rows.append((masks.classes == label).nonzero()[:, 0])
+        options = replace(config, num_instances=num_instances.get(label) or config.num_instances)
+        regions, of_class = masks.regions.select(rows[-1]), links.select(rows[-1])
+        parts.append(_match(regions, cameras, options, residual_px=residual_px, links=of_class))
     joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
     filled = replace(masks, **{name: getattr(joined, name) for name in MATCHED})
     report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
@@ -154,10 +148,8 @@ def check_views(regions: Regions, cameras: Cameras) -> None:
 def check_baselines(cameras: Cameras) -> None:
     """Raises InputError: the cameras are all at one place, where depth cannot be seen."""
     if len(cameras) > 1 and bool(is_coincident(cameras).all()):
-        raise InputError(
-            f"all {len(cameras)} cameras are at one place, expected photos from different places: do R and t map world "
-            "points to the camera?"
-        )
+        expected = "expected photos from different places: do R and t map world points to the camera?"
+        raise InputError(f"all {len(cameras)} cameras are at one place, {expected}")
 
 
 def _check_sizes(regions: Regions, cameras: Cameras) -> None:
@@ -167,10 +159,9 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
         region = int(outside[0])
         view, box = int(regions.view_index[region]), regions.boxes[region].tolist()
         width, height = cameras.sizes[view].tolist()
-        raise InputError(
-            f"region {region} of view {view} has the box {box}, expected one inside the {width} x {height} pixels of "
-            "its camera: are the masks and the photos of different sizes?"
-        )
+        inside = f"one inside the {width} x {height} pixels of its camera"
+        mend = "are the masks and the photos of different sizes?"
+        raise InputError(f"region {region} of view {view} has the box {box}, expected {inside}: {mend}")
 
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
@@ -178,8 +169,7 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
         warn(Finding("no_masks"))
     elif bool((2 * regions.boxes[:, 2:] <= cameras.sizes[regions.view_index]).all()):
         warn(Finding("masks_of_half_size"))
-    pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
-    if pairs:
+    if pairs := torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist():
         warn(Finding("centres_shared", "views {} and {}".format(*pairs[0]), {"count": len(pairs)}))
 
 

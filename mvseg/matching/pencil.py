@@ -31,38 +31,26 @@ class Pencil:
             (P,) float32 in [-2, 2], a monotone stand-in for atan2 that needs one division (the 1-norm angle y / (|x| +
             |y|), continued over the left half-plane). 0 at an epipole, where no half-plane is defined.
         """
-        x, y = self._plane(side, xy)
+        u, v = xy.unbind(1)
+        # plain numbers: a product of (P, 2) with (2, 2) is ten times slower
+        planes = self.plane_from_px[side].tolist()
+        x, y = (torch.mul(u, of_u).add_(v, alpha=of_v).add_(constant) for of_u, of_v, constant in planes)
         angle = y / x.abs().add_(y.abs()).clamp_(min=torch.finfo(x.dtype).tiny)
         if not len(x) or float(x.min()) >= 0:  # as in most pairs: the pencil faces where both cameras look
             return angle
         return torch.where(x < 0, torch.where(y < 0, -2 - angle, 2 - angle), angle)
 
     def pitch(self, side: int, xy: Tensor) -> float:
-        """Mean change of the angle when a pixel moves by one pixel across its epipolar line; see `mean_pitches`."""
-        return mean_pitches(self.plane_from_px[None, side], xy)[0]
+        """Mean change of the angle when a pixel moves by one pixel across its epipolar line.
 
-    def _plane(self, side: int, xy: Tensor) -> tuple[Tensor, Tensor]:
-        u, v = xy.unbind(1)
-        # plain numbers: a product of (P, 2) with (2, 2) is ten times slower
-        x, y = (
-            torch.mul(u, of_u).add_(v, alpha=of_v).add_(constant)
-            for of_u, of_v, constant in self.plane_from_px[side].tolist()
-        )
-        return x, y
-
-
-def mean_pitches(planes_from_px: Tensor, xy: Tensor) -> list[float]:
-    """Mean change of the angle when a pixel moves by one pixel across its epipolar line, in each of Q pencils.
-
-    It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over pixels `xy` (P, 2) of one view; pixels within a pixel
-    of the epipole, where it diverges, count as one pixel away. `planes_from_px` (Q, 2, 3) is one side of each pencil.
-    """
-    planes = planes_from_px.to(xy)[..., None]
-    x, y = (planes[:, row, 0] * xy[:, 0] + planes[:, row, 1] * xy[:, 1] + planes[:, row, 2] for row in (0, 1))
-    across = torch.hypot(x * planes[:, 1, 0] - y * planes[:, 0, 0], x * planes[:, 1, 1] - y * planes[:, 0, 1])
-    one_pixel = planes[:, :, :2].abs().sum((1, 2))
-    means: list[float] = (across / torch.maximum(x.abs() + y.abs(), one_pixel) ** 2).mean(1).tolist()
-    return means
+        It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over pixels `xy` (P, 2) of camera i (`side` 0) or j (1);
+        pixels within a pixel of the epipole, where it diverges, count as one pixel away.
+        """
+        plane = self.plane_from_px[side].to(xy)
+        x, y = (plane[row, 0] * xy[:, 0] + plane[row, 1] * xy[:, 1] + plane[row, 2] for row in (0, 1))
+        across = torch.hypot(x * plane[1, 0] - y * plane[0, 0], x * plane[1, 1] - y * plane[0, 1])
+        one_pixel = plane[:, :2].abs().sum()
+        return float((across / torch.maximum(x.abs() + y.abs(), one_pixel) ** 2).mean())
 
 
 def is_coincident(cameras: Cameras) -> Tensor:

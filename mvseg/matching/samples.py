@@ -87,15 +87,15 @@ def view_runs(regions: Regions, max_per_region: int | None = None) -> tuple[list
 
 
 def draw_points(samples: Sequence[Samples], num_points: int, seed: int) -> list[Samples]:
-    """`num_points` random pixels of each region, drawn with replacement as in the paper (Sec. 3.1); weights 1."""
+    """`num_points` random pixels of each region, drawn with replacement as in the paper (Sec. 3.1); weights 1. The
+    samples are pixels in the order of their regions."""
     generator = torch.Generator().manual_seed(seed)
     drawn = []
     for sample in samples:
         counts = torch.bincount(sample.owner, minlength=sample.num_regions)
         first = counts.cumsum(0) - counts
         draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
-        order = sample.owner.argsort(stable=True)
-        picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
+        picks = (first[:, None] + (draw * counts[:, None]).long()).flatten()
         ones = torch.ones_like(sample.weight[picks])
         drawn.append(replace(sample, xy=sample.xy[picks], owner=sample.owner[picks], weight=ones))
     return drawn

@@ -35,9 +35,7 @@ class ViewGraph:
     @staticmethod
     def of(affinity: Affinity, regions: Regions, links: Links = NO_LINKS) -> ViewGraph:
         """The graph of D regions, with links that do not contradict each other (`Links.components`)."""
-        weights = np.zeros((affinity.num_regions, affinity.num_regions))
-        first, second = affinity.edges.T.cpu().numpy()
-        weights[first, second] = weights[second, first] = affinity.weights.cpu().numpy()
+        weights = affinity.to_dense().double().cpu().numpy()
         return ViewGraph(weights, regions.view_index.cpu().numpy(), regions.num_views, links)
 
     def select(self, index: Ints) -> ViewGraph:

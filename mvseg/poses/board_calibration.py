@@ -20,7 +20,7 @@ from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.markers import Grey, find_board
 from mvseg.poses.numbers import TABLE
-from mvseg.poses.table_fit import Sightings, TableCamera, TableFit, fit_table, opencv_matrix
+from mvseg.poses.table_fit import TableCamera, TableFit, fit_table, opencv_matrix
 
 Seen = dict[int, tuple[np.ndarray, Floats]]  # {place of the angle: numbers and pixels of the corners}
 Poses = dict[int, pycolmap.Rigid3d]  # {place of the angle: cam_from_board}
@@ -83,12 +83,8 @@ def calibrate_turntable(
     used, fit = _fit(boards, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=TABLE.fine)
     angles = np.full(num_angles, np.nan)
     angles[used] = fit.angles
-    return TurntableCalibration(
-        cameras=dict(zip(photos, fit.cameras, strict=True)),
-        angles=angles,
-        residual_px=fit.residual_px,
-        num_corners=len(fit.residuals),
-    )
+    cameras, residual_px = dict(zip(photos, fit.cameras, strict=True)), fit.residual_px
+    return TurntableCalibration(cameras, angles, residual_px=residual_px, num_corners=len(fit.residuals))
 
 
 def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> Seen:
@@ -140,16 +136,9 @@ def _fit(
         for angle, (numbers, px) in corners_of.items()
     ]
     camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
-    fit = fit_table(
-        [cameras[name] for name in sightings],
-        np.array([angles[each] for each in used]),
-        world_from_board,
-        sightings=Sightings(camera=camera, angle=angle, point=point, px=px),
-        noise_px=noise_px,
-        fix_lenses=fix_lenses,
-        tolerance=tolerance,
-    )
-    return used, fit
+    start = [cameras[name] for name in sightings], np.array([angles[each] for each in used]), world_from_board
+    seen = (camera, angle, point, px)
+    return used, fit_table(*start, sightings=seen, noise_px=noise_px, fix_lenses=fix_lenses, tolerance=tolerance)
 
 
 def _board_pose(numbers: np.ndarray, px: Floats, board: BoardConfig, lens: TableCamera) -> pycolmap.Rigid3d:
@@ -174,11 +163,10 @@ def _initialise(
             turned = placed[name].inverse() * pose * world_from_board.inverse()
             angles.setdefault(place, float(np.degrees(_rotation(turned).as_rotvec()[2])))
     zero = angles[min(angles)]
-    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in placed.items()}
-    cameras = {
-        name: replace(lens, R=at_zero[name].rotation.matrix(), t=at_zero[name].translation)
-        for name, lens in lenses.items()
-    }
+    cameras = {}
+    for name, lens in lenses.items():
+        at_zero = placed[name] * _turn_z(zero)
+        cameras[name] = replace(lens, R=at_zero.rotation.matrix(), t=at_zero.translation)
     return cameras, {place: angle - zero for place, angle in angles.items()}, world_from_board
 
 

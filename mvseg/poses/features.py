@@ -41,12 +41,7 @@ def number_photos(images: Path, photos: Sequence[PhotoFile], folder: Path) -> di
 
 
 def make_database(
-    database: Path,
-    folder: Path,
-    numbered: Mapping[str, PhotoFile],
-    *,
-    config: PoseConfig,
-    lens: pycolmap.Camera | None = None,
+    database: Path, folder: Path, numbered: Mapping[str, PhotoFile], *, config: PoseConfig, lens: pycolmap.Camera | None
 ) -> None:
     """Make a new database with all photos, of these names in `folder`; those of one camera share it. `lens` is the
     camera, if it is calibrated. Raises InputError if COLMAP cannot read a photo, or photos of one camera differ in
@@ -77,28 +72,19 @@ def find_features(database: Path, folder: Path, names: Sequence[str], *, image_s
 
 
 def extract_features(
-    database: Path,
-    folder: Path,
-    numbered: Mapping[str, PhotoFile],
-    *,
-    config: PoseConfig,
-    lens: pycolmap.Camera | None = None,
+    database: Path, folder: Path, numbered: Mapping[str, PhotoFile], *, config: PoseConfig, lens: pycolmap.Camera | None
 ) -> None:
     """Find COLMAP's features of all photos of the database, which was made with the same arguments."""
-    options = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=config.image_size)
+    options = {
+        "camera_mode": pycolmap.CameraMode.SINGLE,
+        "reader_options": _reader(config, lens),
+        "extraction_options": pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=config.image_size),
+    }
     with progress_bar(total=len(numbered), name="more features", unit="photo") as bar:
         for names in _names_by_camera(numbered, config):
             for start in range(0, len(names), PHOTOS_AT_ONCE):
                 some = names[start : start + PHOTOS_AT_ONCE]
-                run_cancellable(
-                    pycolmap.extract_features,
-                    database,
-                    folder,
-                    image_names=some,
-                    camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=_reader(config, lens),
-                    extraction_options=options,
-                )
+                run_cancellable(pycolmap.extract_features, database, folder, image_names=some, **options)
                 bar.update(len(some))
 
 
@@ -117,23 +103,20 @@ def _names_by_camera(numbered: Mapping[str, PhotoFile], config: PoseConfig) -> l
 
 def match_features(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> None:
     """Match the features of pairs (i, j) of these photos in the database, and keep what fits one relative pose."""
-    matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = STRUCTURE.seed
     # What stays at its pixels is a backdrop that does not turn with the plant: a third of a photo of it, and all photos
     # register around the wrong thing. Photos without one lose nothing by it.
     verification.filter_stationary_matches = True
     listed = database.with_name("pairs.txt")
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    options = {
+        "matching_options": pycolmap.FeatureMatchingOptions(use_gpu=False),
+        "pairing_options": pycolmap.ImportedPairingOptions(match_list_path=listed),
+        "verification_options": verification,
+    }
     with progress_bar(total=len(pairs), name="matching", unit="pair") as bar:
         for start in range(0, len(pairs), STRUCTURE.pairs_at_once):
             some = pairs[start : start + STRUCTURE.pairs_at_once]
             listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some), newline="\n")
-            run_cancellable(
-                pycolmap.match_image_pairs,
-                database,
-                matching_options=matching,
-                pairing_options=pairing,
-                verification_options=verification,
-            )
+            run_cancellable(pycolmap.match_image_pairs, database, **options)
             bar.update(len(some))

@@ -46,13 +46,10 @@ def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[Foc
     noise, lengths = noise_px(model), []
     for _, camera in sorted(model.cameras.items()):
         focal, *_ = camera.focal_length_idxs()
-        px, deviation = float(camera.params[focal]), None
-        if not is_given:
-            deviation = px
-        if covariance is not None:
-            of_lens = covariance.get_other_params_cov(camera.params)
-            deviation = px if of_lens is None else _deviation(camera, noise**2 * of_lens, focal)
-        lengths.append(FocalLength(px, deviation))
+        px = float(camera.params[focal])
+        of_lens = None if covariance is None else covariance.get_other_params_cov(camera.params)
+        deviation = px if of_lens is None else _deviation(camera, noise**2 * of_lens, focal)
+        lengths.append(FocalLength(px, None if is_given else deviation))
     return lengths
 
 

@@ -85,13 +85,8 @@ def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:
     except InputError as error:
         message = f"{len(points)} corners of the board are seen in two photos or more"
         raise InputError(f"{message}: {error} (is it {board.columns} x {board.rows} of {board.family}?)") from None
-    return Placement(
-        similarity=alignment.similarity,
-        unit=unit,
-        source=f"{int(alignment.is_inlier.sum())} corners of the board",
-        residual=alignment.rms,
-        up=(0.0, 0.0, 1.0),
-    )
+    source, up = f"{int(alignment.is_inlier.sum())} corners of the board", (0.0, 0.0, 1.0)
+    return Placement(similarity=alignment.similarity, unit=unit, source=source, residual=alignment.rms, up=up)
 
 
 def _by_markers(scene: Scene, side: float, unit: str) -> Placement:
@@ -100,16 +95,11 @@ def _by_markers(scene: Scene, side: float, unit: str) -> Placement:
     if not len(sides):
         raise InputError("no whole marker is seen in two photos, expected ArUco or AprilTag markers of --marker's size")
     middle = float(np.median(sides))
-    odd = int((np.abs(sides / middle - 1) > WORLD.spread).sum())
-    if odd:
+    if odd := int((np.abs(sides / middle - 1) > WORLD.spread).sum()):
         warn(Finding("markers_differ", values={"odd": odd, "count": len(sides), "share": WORLD.spread}))
-    residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
-    return Placement(
-        similarity=scale_by(side / middle),
-        unit=unit,
-        source=f"{len(sides)} markers of {side:g} {unit}".rstrip(),
-        residual=residual if len(sides) > 1 else None,
-    )
+    residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side if len(sides) > 1 else None
+    source = f"{len(sides)} markers of {side:g} {unit}".rstrip()
+    return Placement(similarity=scale_by(side / middle), unit=unit, source=source, residual=residual)
 
 
 def marker_sides(corners: dict[Corner, Floats]) -> Floats:
@@ -134,11 +124,8 @@ def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str) -> P
     apart = float(np.linalg.norm(first - second))
     if apart <= WORLD.rounding * float(spreads(scene.cameras.centers.cpu().numpy())[0]):
         raise InputError(f"{names[0]} and {names[1]} are at one place, expected two that are {length:g} apart")
-    return Placement(
-        similarity=scale_by(length / apart),
-        unit=unit,
-        source=f"the distance from {names[0]} to {names[1]}, {length:g} {unit}".rstrip(),
-    )
+    source = f"the distance from {names[0]} to {names[1]}, {length:g} {unit}".rstrip()
+    return Placement(similarity=scale_by(length / apart), unit=unit, source=source)
 
 
 def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
@@ -183,15 +170,15 @@ def _spot(scene: Scene, name: str, places: list[tuple[str, Floats]]) -> Floats:
 
 
 def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
-    positions = read_positions(path)
-    views = find_views(positions.names, scene, source=path)
+    names, xyz, stated = read_positions(path)
+    views = find_views(names, scene, source=path)
     used = [(index, view) for index, view in enumerate(views) if view is not None]
     if len(used) < 2:
-        found = f"{len(used)} of its photos are registered ({list_some(positions.names)})"
+        found = f"{len(used)} of its photos are registered ({list_some(names)})"
         raise InputError(f"{path}: {found}, expected three or more")
-    unit = unit or positions.unit
+    unit = unit or stated
     rows, seen = np.array(used).T
-    centers, target = scene.cameras.centers.cpu().numpy()[seen], positions.xyz[rows]
+    centers, target = scene.cameras.centers.cpu().numpy()[seen], xyz[rows]
     if is_one_line(target):
         return _by_positions_on_a_line(centers, target, path=path, unit=unit)
     with faults_of(path):
@@ -204,7 +191,7 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
         unit=unit,
         source=f"{int(alignment.is_inlier.sum())} positions of {path.name}",
         residual=alignment.rms,
-        left_out=tuple(positions.names[row] for row in rows[~alignment.is_inlier]),
+        left_out=tuple(names[row] for row in rows[~alignment.is_inlier]),
     )
 
 
@@ -226,8 +213,5 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     if misfit > WORLD.misfit:
         warn(Finding("positions_misfit", str(path), {"share": float(misfit)}))
     warn(Finding("positions_on_a_line", str(path)))
-    return Placement(
-        similarity=scale_by(float(np.median(ratios))),
-        unit=unit,
-        source=f"{len(target)} positions on one line of {path.name}",
-    )
+    source = f"{len(target)} positions on one line of {path.name}"
+    return Placement(similarity=scale_by(float(np.median(ratios))), unit=unit, source=source)

@@ -13,16 +13,20 @@ from pathlib import Path
 import pycolmap
 
 from mvseg.errors import InputError
+from mvseg.formats.colmap import read_colmap
 from mvseg.formats.opencv_yaml import Calibration
+from mvseg.formats.rig import write_rig
 from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.features import extract_features, find_features, make_database, match_features, number_photos
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
 from mvseg.poses.photo_files import PhotoFile, calibrated_size
+from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 
 PHOTOS = "photos"  # folder of the photos that COLMAP sees
+IMAGES, MODEL = "images", "sparse/0"  # of a scene folder
 NEXT_STEPS = (
     "more photos with more overlap (every 5 to 10 degrees), sharper and brighter ones, a textured background or table "
     "(newspaper) that stays with the plant, or a turntable calibrated from a board"
@@ -90,18 +94,13 @@ def find_structure(
     for image in list(model.images.values()):
         image.name = photo_of[image.name].name
     registered = {image.name for image in model.images.values() if image.has_pose}
-    earlier: set[int] = set()
-    counts = []  # of the photos of each model that none before it holds
-    for each in models:
-        counts.append(len(set(each.reg_image_ids()) - earlier))
-        earlier |= set(each.reg_image_ids())
-    return Structure(
-        model=model,
-        registered=tuple(photo.name for photo in photos if photo.name in registered),
-        left_out=tuple(photo.name for photo in photos if photo.name not in registered),
-        plain=plain,
-        other_models=tuple(count for count in counts[1:] if count),
+    numbers = [set(each.reg_image_ids()) for each in models]
+    counts = [len(each.difference(*numbers[:place])) for place, each in enumerate(numbers)]  # in none before it
+    taken, left_out = (
+        tuple(photo.name for photo in photos if (photo.name in registered) == is_taken) for is_taken in (True, False)
     )
+    others = tuple(count for count in counts[1:] if count)
+    return Structure(model=model, registered=taken, left_out=left_out, plain=plain, other_models=others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +118,9 @@ def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair]
     database, names, images = task.work / "quick.db", list(task.photo_of), task.work / PHOTOS
     make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
     alike = find_features(database, images, names, image_size=task.config.image_size)
-    plain = _photos_with_few_features(database, task.photo_of)
+    with pycolmap.Database.open(database) as opened:
+        counts = {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
+    plain = tuple(photo.name for name, photo in task.photo_of.items() if counts[name] < STRUCTURE.few_features)
     pairs = choose_pairs([photo.name for photo in task.photo_of.values()], task.config.pairs, alike=alike)
     match_features(database, names, pairs)
     models = _map(task, database, few_matches=False)
@@ -173,22 +174,11 @@ def _map(task: _Task, database: Path, *, few_matches: bool) -> list[pycolmap.Rec
         def count(photos: int) -> None:  # attempts that fail count as well: at most to the end of the bar
             bar.update(min(photos, num_photos - bar.n))
 
-        models = run_cancellable(
-            pycolmap.incremental_mapping,
-            database,
-            task.work / PHOTOS,
-            task.work,
-            _mapping_options(fix_lens=task.lens is not None, few_matches=few_matches),
-            initial_image_pair_callback=lambda: count(2),
-            next_image_callback=lambda: count(1),
-        )
+        options = _mapping_options(fix_lens=task.lens is not None, few_matches=few_matches)
+        told = {"initial_image_pair_callback": lambda: count(2), "next_image_callback": lambda: count(1)}
+        places = database, task.work / PHOTOS, task.work
+        models = run_cancellable(pycolmap.incremental_mapping, *places, options, **told)
     return _sorted(list(models.values()))
-
-
-def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile]) -> tuple[str, ...]:
-    with pycolmap.Database.open(database) as opened:
-        counts = {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
-    return tuple(photo.name for name, photo in photo_of.items() if counts[name] < STRUCTURE.few_features)
 
 
 def _too_few(count: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
@@ -206,3 +196,27 @@ def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolm
     K = calibration.K
     pinhole = {"model": "PINHOLE", "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
     return calibration.lens(*size) or pycolmap.Camera(width=size[0], height=size[1], **pinhole)
+
+
+# --- files of a scene
+
+
+def write_structure(structure: Structure, folder: Path) -> Scene:
+    """Write the COLMAP model of a scene folder, take away the photos that have no pose, and read it as a scene."""
+    for name in structure.left_out:
+        (folder / IMAGES / name).unlink(missing_ok=True)
+    model = folder / MODEL
+    model.mkdir(parents=True, exist_ok=True)
+    structure.model.write_binary(model)
+    return read_colmap(model, folder)
+
+
+def move_structure(structure: Structure, similarity: pycolmap.Sim3d, folder: Path) -> Scene:
+    """Write and read the scene again with its world moved by a similarity."""
+    structure.model.transform(similarity)
+    return write_structure(structure, folder)
+
+
+def write_cameras(scene: Scene, folder: Path) -> None:
+    """Write the rig file of a scene folder: what the COLMAP model says, with unit and up."""
+    write_rig(folder / "cameras.json", scene, [view.path.relative_to(folder).as_posix() for view in scene.views])

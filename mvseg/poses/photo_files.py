@@ -163,9 +163,8 @@ def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) 
         key = (photo.folder, photo.width, photo.height, photo.optics, level[photo.zoom])
         groups["all" if shared else photo.name if shared is False else key].append(photo)
     for first, *others in groups.values():
-        for other in others:
-            if other.size != first.size:
-                sizes = f"{first.name} has {first.width} x {first.height} pixels, "
-                sizes += f"{other.name} {other.width} x {other.height}"
-                raise InputError(f"{sizes}: they cannot share one camera, expected --shared_camera false or none")
+        if other := next((each for each in others if each.size != first.size), None):
+            sizes = f"{first.name} has {first.width} x {first.height} pixels"
+            sizes += f", {other.name} {other.width} x {other.height}"
+            raise InputError(f"{sizes}: they cannot share one camera, expected --shared_camera false or none")
     return list(groups.values())

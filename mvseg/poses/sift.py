@@ -58,9 +58,9 @@ def find_sift(photo: Photo, *, image_size: int, most: int) -> Sift:
     points, histograms = points[:most], np.asarray(histograms[:most], np.float32)
     zoom = np.array(grey.shape[::-1], np.float32) / size
     roots = np.sqrt(histograms / np.maximum(histograms.sum(1, keepdims=True), 1e-9))
+    px = np.array([point.pt for point in points], np.float32) + 0.5  # OpenCV's pixel centres are whole numbers
     return Sift(
-        px=(np.array([point.pt for point in points], np.float32) + 0.5)
-        * zoom,  # OpenCV's pixel centres are whole numbers
+        px=px * zoom,
         scale=np.array([point.size / 2 for point in points], np.float32) * zoom.max(),
         angle=np.radians(np.array([point.angle for point in points], np.float32)),
         descriptors=np.clip(np.rint(STRUCTURE.unit * roots), 0, 255).astype(np.uint8),

@@ -51,21 +51,9 @@ class TableCamera:
     focal_deviation: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Sightings:
-    """P corners of the board in photos.
-
-    Attributes:
-        camera: (P,) int64, which camera saw it.
-        angle: (P,) int64, at which of the angles.
-        point: (P, 3) float64, in the board's frame.
-        px: (P, 2) float64, with lens distortion, pixel centres at half integers.
-    """
-
-    camera: Ints
-    angle: Ints
-    point: Floats
-    px: Floats
+# P corners of the board in photos: (P,) which camera saw it, (P,) at which of the angles, (P, 3) in the board's frame,
+# and (P, 2) pixels with lens distortion, pixel centres at half integers.
+Sightings = tuple[Ints, Ints, Floats, Floats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,10 +120,8 @@ def fit_table(
     adjusted, pose, turned = split(fit.x)
     if not fix_lenses:
         variances = np.diag(np.linalg.pinv(fit.jac.T @ fit.jac))[: of_cameras.size].reshape(of_cameras.shape)[:, 0]
-        sizes = [max(camera.size) for camera in cameras]
-        deviations = np.sqrt(variances.clip(min=0)) * sizes
-        pairs = zip(adjusted, deviations.tolist(), strict=True)
-        adjusted = [replace(camera, focal_deviation=deviation) for camera, deviation in pairs]
+        pairs = zip(adjusted, np.sqrt(variances.clip(min=0)).tolist(), strict=True)
+        adjusted = [replace(camera, focal_deviation=max(camera.size) * deviation) for camera, deviation in pairs]
     errors = _project(adjusted, pose, turned, sightings)
     return TableFit(cameras=adjusted, angles=np.degrees(turned), residuals=errors, cost=2 * float(fit.cost))
 
@@ -160,14 +146,15 @@ def _with_numbers(camera: TableCamera, numbers: Floats) -> TableCamera:
 
 def _project(cameras: Sequence[TableCamera], pose: Floats, angles: Floats, sightings: Sightings) -> Floats:
     """(P, 2) reprojection errors, pixels; world_from_board (6,) and angles (A,) in radians."""
-    shape = Rotation.from_rotvec(pose[:3]).apply(sightings.point) + pose[3:]
-    turned = Rotation.from_rotvec(angles[sightings.angle][:, None] * [0, 0, 1.0]).apply(shape)
-    errors = np.zeros_like(sightings.px)
+    seen_by, place, point, seen_px = sightings
+    shape = Rotation.from_rotvec(pose[:3]).apply(point) + pose[3:]
+    turned = Rotation.from_rotvec(angles[place][:, None] * [0, 0, 1.0]).apply(shape)
+    errors = np.zeros_like(seen_px)
     for index, camera in enumerate(cameras):
-        here = sightings.camera == index
+        here = seen_by == index
         turn = Rotation.from_matrix(camera.R).as_rotvec()
         px, _ = cv2.projectPoints(turned[here], turn, camera.t, opencv_matrix(camera.K), camera.distortion)
-        errors[here] = px[:, 0] - (sightings.px[here] - 0.5)
+        errors[here] = px[:, 0] - (seen_px[here] - 0.5)
     return errors
 
 

@@ -78,9 +78,7 @@ def watch(clip: Path) -> Footage:
     """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second. Warns (InputWarning) of a
     video that ends early: it is cut short or damaged, or the first of its streams is shorter. Raises InputError if the
     video cannot be opened, or has no frames."""
-    numbers: list[int] = []
-    motion: list[float] = []
-    sharpness: list[float] = []
+    rows: list[tuple[int, float, float]] = []
     with _opened(clip) as video, progress_bar(name="video", unit="frame") as bar:
         rate = video.get(cv2.CAP_PROP_FPS)
         every = max(1, round(rate / VIDEO.per_second)) if 0 < rate < 1000 else 1
@@ -89,18 +87,16 @@ def watch(clip: Path) -> Footage:
         for number, frame in _read(video, every=every):
             grey = _shrink(frame)
             track, moved, gone = _follow(track, grey)
-            motion.append(max(base + moved, motion[-1] if motion else 0.0))
+            motion = max(base + moved, rows[-1][1] if rows else 0.0)
+            rows.append((number, motion, float(cv2.Laplacian(grey, cv2.CV_64F).var())))
             base += gone
-            numbers.append(number)
-            sharpness.append(float(cv2.Laplacian(grey, cv2.CV_64F).var()))
             bar.update(1)
-    if not numbers:
+    if not rows:
         raise InputError(f"{clip}: no frame of the video can be read, expected MP4, MOV, 3GP, AVI, MKV or WebM")
-    footage = Footage(
-        frames=np.array(numbers), motion=np.array(motion), sharpness=np.array(sharpness), stated=max(total, 0)
-    )
+    frames, moves, sharpness = map(np.array, zip(*rows, strict=True))
+    footage = Footage(frames=frames, motion=moves, sharpness=sharpness, stated=max(total, 0))
     if footage.ends_early:
-        warn(Finding("film_ends_early", clip.name, {"count": numbers[-1] + 1, "total": total}))
+        warn(Finding("film_ends_early", clip.name, {"count": rows[-1][0] + 1, "total": total}))
     return footage
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.reconstruction.numbers import RAYS
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, nearest_point
 
 
 def spread_views(cameras: Cameras, most: int) -> Tensor:
@@ -55,7 +55,7 @@ def _directions(cameras: Cameras) -> NDArray[np.float64]:
     if 1 - mean_axis @ mean_axis < RAYS.parallel**2:
         target = middle + mean_axis * (centers - middle).norm(dim=1).square().mean().sqrt()
     else:
-        target = cameras.nearest_point(torch.arange(len(cameras)), axes)
+        target = nearest_point(centers, axes)
     ways: NDArray[np.float64] = torch.nn.functional.normalize(centers - target, dim=1).numpy()
     return ways
 

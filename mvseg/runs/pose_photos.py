@@ -20,10 +20,9 @@ from mvseg.poses.config import PoseConfig, WorldFacts
 from mvseg.poses.focal_length import FocalLength, focal_lengths, least_sure
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.lens_faults import LensReport, find_lens_fault
-from mvseg.poses.mapping import Structure, find_structure
+from mvseg.poses.mapping import IMAGES, Structure, find_structure, move_structure, write_cameras, write_structure
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
-from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
 from mvseg.poses.video import check_motion, choose_frames, fill_gaps, frame_name, is_video, watch, write_frames
 from mvseg.results.earlier import Output, check_out, replace_result
 from mvseg.scene import Scene

@@ -21,8 +21,8 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.turntable import read_turntable_parts, write_turntable
 from mvseg.poses.board_calibration import calibrate_turntable
 from mvseg.poses.focal_length import FocalLength
+from mvseg.poses.mapping import IMAGES
 from mvseg.poses.photo_files import PhotoFile, calibrated_size, copy_photos
-from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import Output, replace_result
 from mvseg.runs.pose_photos import check_place, list_folder

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import SimulatedPlant
 
@@ -34,20 +33,9 @@ def arc_cameras(
         span_deg: azimuth from the first to the last camera, above 0; 360 is a full ring without a doubled camera.
         start_deg: azimuth of the first camera.
         elevations_deg: above the horizon, taken in turn by the views; above -90 and below 90.
-        width, height: pixels.
-
-    Raises:
-        InputError: a number out of its range.
     """
-    if num_views < 1:
-        raise InputError(f"{num_views} views asked for, expected at least 1")
-    if not 0 < span_deg <= 360:
-        raise InputError(f"the arc spans {span_deg:g} degrees, expected more than 0 and at most 360")
-    if not elevations_deg or max(abs(angle) for angle in elevations_deg) >= 90:
-        raise InputError("the elevations must be one or more numbers between -90 and 90 degrees")
-    meshes = [leaf.vertices for leaf in plant.leaves]
-    meshes += [part.vertices for part in plant.parts if part.material == "stem"]
-    points = np.concatenate(meshes)
+    stems = [part.vertices for part in plant.parts if part.material == "stem"]
+    points = np.concatenate([*(leaf.vertices for leaf in plant.leaves), *stems])
     center = (points.min(0) + points.max(0)) / 2
     distance = DISTANCE * float(np.linalg.norm(points - center, axis=1).max())
     gaps = max(num_views - 1, 1) if span_deg < 360 else num_views
@@ -59,12 +47,8 @@ def arc_cameras(
     slope = np.abs(cam[..., :2] / cam[..., 2:]).max((0, 1))
     focal = FRAME_FILL * min(width / 2 / slope[0], height / 2 / slope[1])
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(
-        K=torch.from_numpy(np.repeat(K[None], num_views, 0)),
-        R=torch.from_numpy(rotations),
-        t=torch.from_numpy(translations),
-        sizes=torch.tensor([[width, height]] * num_views),
-    )
+    every_K, R, t = map(torch.from_numpy, (np.repeat(K[None], num_views, 0), rotations, translations))
+    return Cameras(K=every_K, R=R, t=t, sizes=torch.tensor([[width, height]] * num_views))
 
 
 def look_at(azimuth: float, elevation: float) -> NDArray[np.float64]:

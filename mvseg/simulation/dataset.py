@@ -55,26 +55,19 @@ class Preset:
     is_wild: bool = False
 
 
+TRAIN = Preset(
+    plants=(("train", 70), ("val", 4)),
+    leaves=(2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48),
+    views=(9,),
+    families=EVALUATED_FAMILIES * 10 + ("leggy",) * 10,  # to learn that bare stems are not leaves
+    has_free_cameras=True,
+    has_coco=True,
+)
+WILD_PLANTS, WILD_FAMILIES = (("train", 8), ("val", 1)), (*EVALUATED_FAMILIES, "leggy")
 PRESETS = {
     "paper-eval": Preset(plants=(("dev", 3), ("test", 6)), leaves=(4, 8, 16, 32), views=(3, 5, 10, 20)),
-    "train": Preset(
-        plants=(("train", 70), ("val", 4)),
-        leaves=(2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48),
-        views=(9,),
-        families=EVALUATED_FAMILIES * 10 + ("leggy",) * 10,  # to learn that bare stems are not leaves
-        has_free_cameras=True,
-        has_coco=True,
-    ),
-    "wild": Preset(
-        plants=(("train", 8), ("val", 1)),
-        leaves=(2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48),
-        views=(9,),
-        size=(512, 512),
-        families=(*EVALUATED_FAMILIES, "leggy"),
-        has_free_cameras=True,
-        has_coco=True,
-        is_wild=True,
-    ),
+    "train": TRAIN,
+    "wild": replace(TRAIN, plants=WILD_PLANTS, size=(512, 512), families=WILD_FAMILIES, is_wild=True),
 }
 
 
@@ -111,15 +104,8 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
     """Write the scenes of a preset, their list `scenes.csv`, and COCO files where the preset asks for them.
 
     A finished scene is skipped, so the same call goes on after an interruption. The number of workers changes no file.
-
-    Args:
-        preset: a key of `PRESETS` or a `Preset` of your own.
-        seed: >= 0; other seeds give other plants.
-        num_workers: processes, >= 1.
-
-    Raises:
-        InputError: an unknown preset, a number out of range, a folder with a data set of another preset or seed, or one
-            that another process is writing to.
+    Raises InputError: an unknown preset, a number out of range, a folder with a data set of another preset or seed, or
+    one that another process is writing to.
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
@@ -133,20 +119,14 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
     folder.mkdir(parents=True, exist_ok=True)
     with lock_folder(folder):
         claim_dataset(folder, recipe=json.dumps({"preset": asdict(preset), "seed": seed}, indent=1))
-        write_scenes(folder, preset, list_specs(preset, seed), num_workers=num_workers)
-
-
-def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_workers: int) -> None:
-    """Write the scenes that are not there yet, and the files that list them all."""
-    work = partial(finish_scene, folder, preset)
-    results = tqdm(run_all(work, scenes, num_workers), total=len(scenes), unit="scene", desc=str(folder))
-    annotated = list(zip(scenes, results, strict=True))
-    if preset.has_coco:
-        for split, _ in preset.plants:
+        scenes, work = list_specs(preset, seed), partial(finish_scene, folder, preset)
+        results = tqdm(run_all(work, scenes, num_workers), total=len(scenes), unit="scene", desc=str(folder))
+        annotated = list(zip(scenes, results, strict=True))
+        for split, _ in preset.plants if preset.has_coco else ():
             photos = [photo for scene, of_scene in annotated if scene.split == split for photo in of_scene]
             write_annotations(folder / f"{split}.json", photos)
-    columns = [field.name for field in fields(SceneSpec)]
-    write_table(folder / "scenes.csv", columns, [tuple(asdict(scene).values()) for scene in scenes])
+        columns = [field.name for field in fields(SceneSpec)]
+        write_table(folder / "scenes.csv", columns, [tuple(asdict(scene).values()) for scene in scenes])
 
 
 def claim_dataset(folder: Path, *, recipe: str) -> None:

@@ -14,12 +14,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvseg.arrays import Floats
-from mvseg.errors import InputError
 from mvseg.simulation.blades import Arc, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES, Family, draw_blade
 from mvseg.simulation.pot import Part, Pot, draw_pot, lift, make_tube, pot_parts
 
-MAX_LEAVES = 64  # limit: leaves of a plant
 GOLDEN_ANGLE = math.radians(137.50776)
 POSES_TRIED = 8  # limit: per frond; the least crowded one is kept, so that blades seldom cut through each other
 CLEARANCE = 6.0  # chosen: mm; blades that come closer than this crowd each other
@@ -73,22 +71,8 @@ class Frond:
 
 
 def grow_plant(family: str, num_leaves: int, seed: int) -> SimulatedPlant:
-    """Grow a plant, in mm, with pot or bed and the ground; the same arguments give the same plant, bit for bit.
-
-    Args:
-        family: a key of `FAMILIES`.
-        num_leaves: 1 to 64 instances, ids from 1 on; the leaflets of a compound leaf count one each.
-        seed: >= 0.
-
-    Raises:
-        InputError: an unknown family, or a number of leaves or a seed out of range.
-    """
-    if family not in FAMILIES:
-        raise InputError(f"unknown plant family '{family}', expected one of {', '.join(FAMILIES)}")
-    if not 1 <= num_leaves <= MAX_LEAVES:
-        raise InputError(f"{num_leaves} leaves asked for, expected 1 to {MAX_LEAVES}")
-    if seed < 0:
-        raise InputError(f"the seed is {seed}, expected 0 or more")
+    """Grow a plant, in mm, with pot or bed and the ground; the same arguments give the same plant, bit for bit. It has
+    1 to 64 leaves, ids from 1 on; the leaflets of a compound leaf count one each."""
     ranges = FAMILIES[family]
     rng = np.random.default_rng([seed, num_leaves, list(FAMILIES).index(family)])
     pot = draw_pot(ranges, rng)
@@ -96,7 +80,9 @@ def grow_plant(family: str, num_leaves: int, seed: int) -> SimulatedPlant:
     stems, nodes = grow_shoots(len(blade_counts), ranges, rng)
     fronds: list[Frond] = []
     for node, num_blades in zip(nodes, blade_counts, strict=True):
-        fronds.append(place_frond(node, ranges, rng, num_blades=num_blades, pot=pot, others=fronds))
+        taken = cKDTree(np.concatenate([FAR_AWAY, *(frond.points for frond in fronds)]))
+        poses = [lift_frond(grow_frond(node, ranges, rng, num_blades=num_blades), pot) for _ in range(POSES_TRIED)]
+        fronds.append(min(poses, key=lambda frond: crowding(frond, taken)))
     blades = [blade for frond in fronds for blade in frond.blades]
     leaves = tuple(leaf_from_blade(index + 1, blade) for index, blade in enumerate(blades))
     tubes = [make_tube("stem", stem, radius=ranges.stem_radius, taper=0.5) for stem in stems]
@@ -120,15 +106,6 @@ def split_into_fronds(num_leaves: int, family: Family, rng: np.random.Generator)
     while sum(counts) < num_leaves:
         counts.append(min(int(rng.choice(family.leaflets)), most, num_leaves - sum(counts)))
     return counts
-
-
-def place_frond(
-    node: StemNode, family: Family, rng: np.random.Generator, *, num_blades: int, pot: Pot, others: list[Frond]
-) -> Frond:
-    """The least crowded of a few random poses, lifted off the soil."""
-    taken = cKDTree(np.concatenate([FAR_AWAY, *(other.points for other in others)]))
-    poses = [lift_frond(grow_frond(node, family, rng, num_blades=num_blades), pot) for _ in range(POSES_TRIED)]
-    return min(poses, key=lambda frond: crowding(frond, taken))
 
 
 def crowding(frond: Frond, taken: cKDTree) -> float:

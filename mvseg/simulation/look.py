@@ -45,6 +45,7 @@ class Look:
     through: Floats  # colour of the light that passes through a blade
     vein: float
     num_veins: float
+    has_parallel_veins: bool
     quilting: float  # slope of the bulges between the veins
     spots: float
     gloss: float
@@ -64,7 +65,7 @@ class Look:
     marking: Marking | None = None
 
 
-def draw_look(rng: np.random.Generator) -> Look:
+def draw_look(rng: np.random.Generator, *, has_parallel_veins: bool = False) -> Look:
     """Random light, materials and camera."""
     height, azimuth = math.radians(rng.uniform(30, 80)), rng.uniform(0, 2 * np.pi)
     to_sun = [math.cos(height) * math.cos(azimuth), math.cos(height) * math.sin(azimuth), math.sin(height)]
@@ -89,6 +90,7 @@ def draw_look(rng: np.random.Generator) -> Look:
         through=leaf * rng.uniform(0.4, 0.9) * np.array([1.2, 1.2, 0.3], np.float32),
         vein=rng.uniform(0.1, 0.6),
         num_veins=rng.uniform(6, 10),
+        has_parallel_veins=has_parallel_veins,
         quilting=rng.uniform(0, 0.14),
         spots=1.8 * rng.uniform(0, 1) ** 3,
         gloss=rng.uniform(0.1, 0.6),

@@ -67,7 +67,6 @@ class Stage:
     attributes: Floats  # (P, 11): normal, sky light on the upper and on the lower side, uv
     face_normals: Floats  # (F, 3)
     along: Floats  # (F, 3) unit direction of growing u
-    has_parallel_veins: bool
     look: Look
 
 
@@ -123,7 +122,7 @@ def trace_rays(
         normal=values[:, :3], upper=values[:, 3:6], lower=values[:, 6:9], uv=values[:, 9:],
         lit=gather_sunlight(stage, points, face_normal, rng=rng),
     )  # fmt: skip
-    color[hit] = shade(stage.look, hits, has_parallel_veins=stage.has_parallel_veins)
+    color[hit] = shade(stage.look, hits)
     return color, face, depth
 
 
@@ -151,15 +150,12 @@ def build_stage(plant: SimulatedPlant, *, seed: int) -> Stage:
     along = np.cross(du[:, :1] * second - du[:, 1:] * first, across)  # gradient of u, up to a positive factor
     normals = unit(np.stack([np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in across.T], 1))
     bvh = build_bvh(mesh)
-    look = draw_look(np.random.default_rng(seed))
+    look = draw_look(np.random.default_rng(seed), has_parallel_veins=FAMILIES[plant.family].has_parallel_veins)
     if plant.is_wild:
         look = draw_wild_look(look, np.random.default_rng([seed, 1]))
     upper, lower = gather_skylight(bvh, look, vertices=vertices.astype(np.float32), normals=normals)
     attributes = np.concatenate([normals, upper, lower, mesh.uv.astype(np.float32)], 1)
-    return Stage(
-        mesh=mesh, bvh=bvh, attributes=attributes, face_normals=unit(across), along=unit(along),
-        has_parallel_veins=FAMILIES[plant.family].has_parallel_veins, look=look,
-    )  # fmt: skip
+    return Stage(mesh=mesh, bvh=bvh, attributes=attributes, face_normals=unit(across), along=unit(along), look=look)
 
 
 def merge_meshes(plant: SimulatedPlant) -> Mesh:

@@ -33,16 +33,9 @@ MIN_PIXELS = 30  # limit: a leaf with fewer visible pixels in a view is left out
 
 
 def write_scene(folder: Path | str, plant: SimulatedPlant, cameras: Cameras, *, seed: int) -> None:
-    """Photograph a plant and write the scene folder described above. A failure leaves nothing behind.
-
-    Args:
-        folder: must not exist; its parent is made.
-        plant: seen by the cameras in its own world units.
-        seed: of light, materials, noise and of the numbers in `masks/`; the truth does not depend on it.
-
-    Raises:
-        InputError: the folder exists.
-    """
+    """Photograph a plant and write the scene folder described above. A failure leaves nothing behind. `seed` is that of
+    light, materials, noise and of the numbers in `masks/`; the truth does not depend on it. Raises InputError: the
+    folder exists."""
     folder = Path(folder)
     if folder.exists():
         raise InputError(f"{folder} exists already, expected a new folder for the scene")
@@ -55,17 +48,15 @@ def write_views(folder: Path, plant: SimulatedPlant, cameras: Cameras, *, seed: 
     """Write rig file, photos, masks and true label images."""
     (folder / "images").mkdir()
     stage = build_stage(plant, seed=seed)
-    names = [f"{view:03d}" for view in range(len(cameras))]
-    for view, name in enumerate(names):
+    views = tuple(View(f"{view:03d}", folder / f"images/{view:03d}.jpg") for view in range(len(cameras)))
+    for view, each in enumerate(views):
         shot = render_stage(stage, cameras, view)
-        truth = drop_small(shot.ids, MIN_PIXELS)
-        write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
-        write_label_png(folder / "truth" / f"{name}.png", truth)
-        write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))
-    files = [f"images/{name}.jpg" for name in names]
-    views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
+        truth, shuffle = drop_small(shot.ids, MIN_PIXELS), np.random.default_rng([seed, view])
+        write_jpeg(each.path, shot.rgb)
+        write_label_png(folder / "truth" / f"{each.name}.png", truth)
+        write_label_png(folder / "masks" / f"{each.name}.png", shuffle_labels(truth, shuffle))
     scene = Scene(name=folder.name, views=views, cameras=cameras, unit=plant.unit, up=(0.0, 0.0, 1.0))
-    write_rig(folder / "cameras.json", scene, files)
+    write_rig(folder / "cameras.json", scene, [f"images/{each.path.name}" for each in views])
 
 
 def write_truth(folder: Path, plant: SimulatedPlant) -> None:

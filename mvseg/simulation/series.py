@@ -76,14 +76,6 @@ class SeriesSpec:
     num_views: tuple[int, int] = (10, 12)
     size: tuple[int, int] = (480, 480)
 
-    def __post_init__(self) -> None:
-        if self.family not in FAMILIES:
-            raise InputError(f"unknown plant family '{self.family}', expected one of {', '.join(FAMILIES)}")
-        if self.leaves[0] < 1 or self.leaves[1] < 0 or self.seed < 0:
-            raise InputError(f"{self.name}: leaves {self.leaves}, seed {self.seed}: expected 1 or more, 0 or more")
-        if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
-            raise InputError(f"{self.name}: the times {self.times} do not rise")
-
 
 @dataclass(frozen=True)
 class PotPlace:
@@ -99,11 +91,9 @@ class PotPlace:
     def place(self, points: Floats) -> Floats:
         """Points (P, 3) of the plant in the world of this date."""
         axis = np.array([-math.sin(math.radians(self.towards)), math.cos(math.radians(self.towards)), 0.0])
-        turned = Rotation.from_rotvec(math.radians(self.lean) * axis) * Rotation.from_euler(
-            "z", self.turn, degrees=True
-        )
-        placed: Floats = turned.apply(points) + (self.x, self.y, 0.0)
-        return placed
+        turn = Rotation.from_euler("z", self.turn, degrees=True)
+        placed: Floats = (Rotation.from_rotvec(math.radians(self.lean) * axis) * turn).apply(points)
+        return placed + (self.x, self.y, 0.0)
 
 
 @dataclass(frozen=True)
@@ -174,7 +164,7 @@ def plan_plant(spec: SeriesSpec) -> GrowingPlant:
     counts = split_into_fronds(total, family, rng)
     num_shoots = math.ceil(len(counts) / family.per_shoot)
     shoots, start = [], rng.uniform(0, 2 * np.pi)
-    for index, share in enumerate(np.array_split(np.arange(len(counts)), num_shoots)):
+    for index, share in enumerate(np.array_split(counts, num_shoots)):
         foot, tilt = place_foot(family, rng, azimuth=start + index * GOLDEN_ANGLE, is_first=index == 0)
         levels = math.ceil(len(share) / family.per_node)
         shoots.append((foot, foot.scale * rng.uniform(*family.internode, levels), tilt))
@@ -188,7 +178,7 @@ def _seat_fronds(
     family = FAMILIES[spec.family]
     span = spec.times[-1] - spec.times[0]
     turns = [rng.uniform(0, 2 * np.pi) for _ in shoots]
-    share_of = [len(share) for share in np.array_split(np.arange(len(counts)), len(shoots))]
+    share_of = [len(share) for share in np.array_split(counts, len(shoots))]
     slots = [(n // family.per_node, shoot, n % family.per_node) for shoot, k in enumerate(share_of) for n in range(k)]
     slots.sort(key=lambda slot: (slot[0] / (share_of[slot[1]] or 1), slot))
     num_old = int(np.searchsorted(np.cumsum(counts), spec.leaves[0])) + 1
@@ -213,10 +203,9 @@ def _uncrowd(plant: GrowingPlant) -> GrowingPlant:
     seats, day = list(plant.seats), plant.spec.times[-1] - plant.spec.times[0] + EXPANSION
     taken = FAR_AWAY
     for index, seat in enumerate(seats):
-        stem, tree, tried = plant._stem(seat.shoot, day), cKDTree(taken), []
-        for attempt in range(POSES_TRIED):
-            other = replace(seat, seed=(*seat.seed[:2], attempt))
-            tried.append((other, plant._frond(other, day, stem, FAMILIES[plant.spec.family])))
+        stem, tree = plant._stem(seat.shoot, day), cKDTree(taken)
+        others = [replace(seat, seed=(*seat.seed[:2], attempt)) for attempt in range(POSES_TRIED)]
+        tried = [(other, plant._frond(other, day, stem, FAMILIES[plant.spec.family])) for other in others]
         seats[index], frond = min(tried, key=lambda pose: crowding(pose[1], tree))
         taken = np.concatenate([taken, frond.points])
     return replace(plant, seats=tuple(seats))
@@ -285,12 +274,10 @@ def write_series(folder: Path, specs: Sequence[SeriesSpec]) -> None:
 
     Every scene is one of `write_scene`; its truth has the same number for the same leaf on all dates. `series.csv` is a
     table for `mvseg batch` (scene, name, plant, time), and `truth.csv` has one row per leaf and date (area, length,
-    width, dryness). Raises InputError: the folder exists, or two plants have one name.
+    width, dryness). Raises InputError: the folder exists.
     """
     if folder.exists():
         raise InputError(f"{folder} exists already, expected a new folder for the series")
-    if len({spec.name for spec in specs}) < len(specs):
-        raise InputError("two plants of the series have one name")
     scenes, truth = [], []
     with folder_whole(folder) as partial:
         for spec in specs:
@@ -312,11 +299,8 @@ def draw_specs(num_plants: int, *, seed: int = 0) -> list[SeriesSpec]:
     for index in range(num_plants):
         rng = np.random.default_rng([seed, index, 3])
         first, new = int(rng.integers(9, 20)), int(rng.integers(3, 11))
-        times = np.round(np.cumsum(rng.uniform(1, 3, NUM_DATES)) - 1, 1)
+        times = tuple(np.round(np.cumsum(rng.uniform(1, 3, NUM_DATES)) - 1, 1).tolist())
         family, own_seed = families[index % len(families)], int(rng.integers(1 << 30))
-        wilts = int(rng.integers(1, NUM_DATES)) if rng.random() < 0.5 else None
-        specs.append(
-            SeriesSpec(name=f"{family}-{index:02d}", family=family, leaves=(first, new), times=tuple(times.tolist()),
-                       seed=own_seed, wilts=wilts)
-        )  # fmt: skip
+        name, wilts = f"{family}-{index:02d}", int(rng.integers(1, NUM_DATES)) if rng.random() < 0.5 else None
+        specs.append(SeriesSpec(name, family, leaves=(first, new), times=times, seed=own_seed, wilts=wilts))
     return specs

@@ -51,15 +51,13 @@ class Hits:
     lit: Floats
 
 
-def shade(look: Look, hits: Hits, *, has_parallel_veins: bool) -> Floats:
+def shade(look: Look, hits: Hits) -> Floats:
     """Radiance (n, 3) towards the camera."""
     leaf, rest = np.flatnonzero(hits.material == LEAF), np.flatnonzero(hits.material != LEAF)
     leaf_uv = hits.uv[leaf]
     albedo, through, normal = np.zeros_like(hits.points), np.zeros_like(hits.points), hits.face_normal.copy()
     albedo[rest] = part_color(look, hits.material[rest], hits.points[rest])
-    albedo[leaf], through[leaf], slope = leaf_color(
-        look, hits.leaf_id[leaf], leaf_uv, dryness=hits.dryness[leaf], has_parallel_veins=has_parallel_veins
-    )
+    albedo[leaf], through[leaf], slope = leaf_color(look, hits.leaf_id[leaf], leaf_uv, dryness=hits.dryness[leaf])
     normal[leaf] = unit(hits.normal[leaf] + slope[:, None] * hits.along[leaf])
     is_upper = (dot(normal, hits.view) < 0)[:, None]
     normal = np.where(is_upper, normal, -normal)
@@ -87,7 +85,7 @@ def highlight(look: Look, uv: Floats, *, normal: Floats, view: Floats, direct: F
 
 
 def leaf_color(
-    look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, dryness: Floats, has_parallel_veins: bool
+    look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, dryness: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """Colour of leaves of some dryness (n,) at (n, 2) positions `uv` on them: albedo (n, 3), colour (n, 3) of the light
     that passes through, and slope (n,) of the surface towards the tip."""
@@ -95,7 +93,7 @@ def leaf_color(
     tint = look.leaf_spread * np.sin(number[:, None] * np.array([12.99, 78.23, 37.72], np.float32))
     blotch = sample_texture(look.texture, u * 40 + number * 37, v * 18 + number * 11)
     side = np.abs(v)
-    if has_parallel_veins:
+    if look.has_parallel_veins:
         phase, along_vein = side * look.num_veins, np.ones_like(v)
     else:
         phase, along_vein = u * look.num_veins - 1.6 * side + 0.15 * blotch, 1 - v**2
@@ -118,7 +116,7 @@ def leaf_color(
     albedo += np.clip(2 * dryness - 1, 0, 1)[:, None] * (BROWN * grain**2 - albedo)
     through = look.through * np.exp(tint) * (1 - 0.6 * vein) * (1 - 0.8 * sick) * (1 - 0.9 * dryness[:, None])
     bulge = look.quilting * (np.sin(2 * np.pi * phase) + 0.5 * blotch) * along_vein
-    return albedo, through, np.zeros_like(bulge) if has_parallel_veins else bulge
+    return albedo, through, np.zeros_like(bulge) if look.has_parallel_veins else bulge
 
 
 def part_color(look: Look, material: NDArray[np.uint8], points: Floats) -> Floats:

@@ -67,11 +67,8 @@ def unroll_leaf(rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Floats:
     v = np.linspace(0.03, 0.97, COLUMNS)
     t = left[:, None] + v * (right - left)[:, None]
     texels = center + s[:, None, None] * along + t[..., None] * across - 0.5
-    skin = cv2.remap(
-        filled, texels[..., 0].astype(np.float32), texels[..., 1].astype(np.float32), cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )  # fmt: skip
-    return np.asarray(skin, np.float32)
+    x, y = np.moveaxis(texels.astype(np.float32), -1, 0)
+    return np.asarray(cv2.remap(filled, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 
 def dress(look: Look, skins: tuple[Floats, ...], rng: np.random.Generator) -> Look:
@@ -79,8 +76,7 @@ def dress(look: Look, skins: tuple[Floats, ...], rng: np.random.Generator) -> Lo
     colours, with markings along veins, in patches or at the margin, or with leaves of any hue, dark ones included."""
     kind = rng.choice(["as it is", "skin", "marking", "hue"], p=[0.33, 0.37, 0.18, 0.12])
     if kind == "skin":
-        skin = skins[rng.integers(len(skins))]
-        skin = skin[:: rng.choice([1, -1]), :: rng.choice([1, -1])]
+        skin = skins[rng.integers(len(skins))][:: rng.choice([1, -1]), :: rng.choice([1, -1])]
         mean = np.maximum(skin.mean((0, 1)), 1e-3)
         wanted = 0.07 * 3.2 ** rng.uniform(0, 1) * mean / mean.max() * np.exp(rng.normal(0, 0.15, 3))
         skin = np.ascontiguousarray((skin * wanted / mean).clip(0, 0.9), np.float32)

@@ -96,9 +96,8 @@ def grow_cotyledons(stem: Floats, rng: np.random.Generator) -> tuple[list[Floats
     blades, petioles = [], []
     for azimuth in (start, start + np.pi + rng.normal(0, 0.15)):
         elevation, length = rng.uniform(0.1, 0.8), size * rng.uniform(0.85, 1.15)
-        petiole = arc_points(
-            point, Arc(azimuth=azimuth, elevation=elevation, steps=np.full(4, length * rng.uniform(0.1, 0.2)))
-        )
+        arc = Arc(azimuth=azimuth, elevation=elevation, steps=np.full(4, length * rng.uniform(0.1, 0.2)))
+        petiole = arc_points(point, arc)
         blade = Blade(
             length=length,
             width=length * rng.uniform(0.6, 0.95),

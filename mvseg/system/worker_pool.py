@@ -148,9 +148,6 @@ def _start_worker(parent: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     stay_on_one_thread()  # takes seconds, in which the parent may be killed
-    from tqdm import tqdm
-
-    tqdm.set_lock(threading.RLock())  # instead of one that all processes share, and that has to be given back
 
 
 def _end_with(parent: Connection) -> None:

@@ -152,19 +152,17 @@ class TrainConfig:
         if not 0 < self.scale_range[0] <= self.scale_range[1] < math.inf:
             raise InputError(f"scale_range is {self.scale_range}, expected two factors above 0, the smaller one first")
         if self.batch_size % self.images_per_forward:
-            raise InputError(
-                f"batch_size {self.batch_size} is not a multiple of images_per_forward {self.images_per_forward}"
-            )
+            chunks = f"images_per_forward {self.images_per_forward}"
+            raise InputError(f"batch_size {self.batch_size} is not a multiple of {chunks}")
         if self.recolor and self.backgrounds is None:
             raise InputError("recolor is set and backgrounds is not, expected a folder of photos without leaves")
         if self.hold_out_every == 1:
             raise InputError("hold_out_every is 1, which leaves nothing to train on; expected 0 or at least 2")
-        if (self.photos is None) != (self.labels is None):
-            raise InputError("photos and labels belong together, expected both or neither")
+        for photos, labels in (("photos", "labels"), ("val_photos", "val_labels")):
+            if (getattr(self, photos) is None) != (getattr(self, labels) is None):
+                raise InputError(f"{photos} and {labels} belong together, expected both or neither")
         if self.photos is None and self.from_results is None:
             raise InputError("neither photos nor from_results is set, expected something to learn from")
-        if (self.val_photos is None) != (self.val_labels is None):
-            raise InputError("val_photos and val_labels belong together, expected both or neither")
         if self.val_photos is not None and self.hold_out_every:
             raise InputError("hold_out_every and val_photos are both set, expected one way to validate")
 

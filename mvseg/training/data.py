@@ -33,11 +33,15 @@ from mvseg.formats.find_views import LonePhotos, find_views
 from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
 from mvseg.formats.label_png import ignore_border
 from mvseg.formats.masks.class_numbers import INTERPOLATED, count_between, is_interpolated
-from mvseg.formats.masks.faults import COVERS
 from mvseg.formats.masks.read_views import read_photo_masks
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
+from mvseg.formats.masks.view_regions import COVERS
 from mvseg.formats.photos import photos_in, warn_of_turned
+from mvseg.formats.run_lengths import encode_mask
+from mvseg.results.photo_masks import mask_in_photo
+from mvseg.results.read import load_result
 from mvseg.scene import View
+from mvseg.training.view_labels import are_labels
 
 CATEGORY = "leaf"  # of masks in files that are named after their photo
 
@@ -140,8 +144,7 @@ def _list_coco(photos: Path, photo_set: LonePhotos, masks: MaskFiles, *, crowd: 
     annotations_of: dict[str, list[CocoAnnotation]] = defaultdict(list)
     for annotation in content.annotations:
         annotations_of[str(annotation.image_id)].append(annotation)
-    unlisted = sorted(annotations_of.keys() - {str(image.id) for image in content.images})
-    if unlisted:
+    if unlisted := sorted(annotations_of.keys() - {str(image.id) for image in content.images}):
         raise InputError(f"{labels} has annotations of image {unlisted[0]}, which it does not list")
     size_of = {str(image.id): (image.width or 1 << 30, image.height or 1 << 30) for image in content.images}
     with faults_of(labels):
@@ -162,6 +165,39 @@ def _list_coco(photos: Path, photo_set: LonePhotos, masks: MaskFiles, *, crowd: 
         samples.append(Sample(name=name, photo=photo, annotations=tuple(taken), size=size, class_of=class_of))
     names = tuple(category.name for category in categories)
     return SampleList(tuple(sorted(samples, key=lambda sample: sample.name)), names)
+
+
+def list_results(folder: Path) -> SampleList:
+    """The samples of a result folder of `mvseg infer` or `mvseg match`, or of all results in a folder: one for each
+    photo of the scene that run.json names, called "<result>/<photo>".
+
+    Raises InputError: no result, or a broken one, see `load_result`; no mask to learn from; photos are gone.
+    """
+    is_result = (folder / "instances.json").is_file()
+    found = [folder] if is_result else sorted(path.parent for path in folder.glob("*/instances.json"))
+    if not found:
+        raise InputError(f"{folder}: holds no result (no instances.json), expected a folder that `mvseg infer` wrote")
+    return SampleList(tuple(sample for result in found for sample in _list_photos(result)), ("leaf",))
+
+
+def _list_photos(folder: Path) -> list[Sample]:
+    result = load_result(folder)
+    is_label = are_labels(result.masks, result.instances.probabilities)
+    if not is_label.any():
+        raise InputError(f"{folder}: holds no mask that is sure enough to learn from, expected a result with leaves")
+    samples, sizes = [], result.scene.cameras.sizes.tolist()
+    for view, (width, height) in enumerate(sizes):
+        photo = result.scene.views[view].path
+        if not photo.is_file():
+            raise InputError(f"{folder}: its photo {photo} is gone, expected the photos of the result")
+        masks = []
+        for row in (result.masks.view_index == view).nonzero()[:, 0].tolist():
+            ids = {"id": row + 1, "image_id": view + 1, "category_id": 1}
+            mask = encode_mask(mask_in_photo(result, row))
+            masks.append(CocoAnnotation(**ids, segmentation=mask, iscrowd=int(not is_label[row])))
+        name, size = f"{folder.name}/{result.scene.views[view].name}{photo.suffix}", (width, height)
+        samples.append(Sample(name=name, photo=photo, annotations=tuple(masks), size=size, class_of={"1": 1}))
+    return sorted(samples, key=lambda sample: sample.name)
 
 
 # --- reading and checking
@@ -276,11 +312,9 @@ def keep_sound(
     with faults_of(f"{what} samples"):
         counts, broken = check_samples(samples.samples)
     if broken and not skip_broken:
-        first = "; ".join(list(broken.values())[:3])
-        raise InputError(
-            f"{len(broken)} of {len(samples)} {what} samples are broken ({first}{'; ...' if len(broken) > 3 else ''}), "
-            "expected none unless skip_broken is set"
-        )
+        first = "; ".join([*list(broken.values())[:3], *(["..."] if len(broken) > 3 else [])])
+        count = f"{len(broken)} of {len(samples)} {what} samples are broken"
+        raise InputError(f"{count} ({first}), expected none unless skip_broken is set")
     if not sum(counts):
         raise InputError(f"none of the {len(samples)} {what} samples holds an instance, expected at least one")
     every = range(len(samples))

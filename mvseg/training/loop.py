@@ -23,7 +23,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -39,19 +39,18 @@ from torchvision.models.detection import MaskRCNN
 from tqdm import tqdm
 
 from mvseg.detectors.mask_rcnn import count_parameters
+from mvseg.detectors.run import detect
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
-from mvseg.evaluation.average_precision import average_precision
+from mvseg.evaluation.average_precision import Annotations, annotate_detections, annotate_truth, average_precision
 from mvseg.results.earlier import Output, check_out, claim_folder
 from mvseg.system.atomic import lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.training.augmentation import AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
-from mvseg.training.data import SampleList, keep_sound, list_samples
-from mvseg.training.from_results import list_results
+from mvseg.training.data import SampleList, keep_sound, list_results, list_samples, read_sample
 from mvseg.training.processes import Processes, join_processes
 from mvseg.training.state import TrainingState, apply_gradients, learning_rate, save_state, start_state
-from mvseg.training.validation import detect_and_label
 
 logger = logging.getLogger(__name__)
 OUTPUT = Output("training")
@@ -100,10 +99,8 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
     """
     with join_processes(config.device) as processes:
         if config.num_chunks % processes.count:
-            raise InputError(
-                f"batch_size / images_per_forward is {config.num_chunks}, "
-                f"expected a multiple of the number of processes ({processes.count})"
-            )
+            expected = f"expected a multiple of the number of processes ({processes.count})"
+            raise InputError(f"batch_size / images_per_forward is {config.num_chunks}, {expected}")
         cuda = [processes.device] if processes.device.type == "cuda" else []
         with torch.random.fork_rng(devices=cuda):
             samples, held_out = processes.ask_first(lambda: find_samples(config))
@@ -124,26 +121,24 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
         parts.append(list_samples(config.photos, config.labels, crowd=crowd))
     parts += [] if config.from_results is None else [list_results(config.from_results)]
     if len({part.categories for part in parts}) > 1:
-        raise InputError(
-            f"{config.labels} has categories {parts[0].categories}, expected {parts[1].categories} as results"
-        )
+        expected = f"expected {parts[1].categories} as results"
+        raise InputError(f"{config.labels} has categories {parts[0].categories}, {expected}")
     samples, held_out = SampleList(sum((part.samples for part in parts), ()), parts[0].categories), None
     if config.val_photos is not None and config.val_labels is not None:
         held_out = list_samples(config.val_photos, config.val_labels, crowd=crowd)
         if held_out.categories != samples.categories:
             raise InputError(f"{config.val_labels} has categories {held_out.categories}, expected {samples.categories}")
-    elif config.hold_out_every:
+    elif every := config.hold_out_every:
         indices = range(len(samples))
-        held_out = samples.select(indices[:: config.hold_out_every])
-        samples = samples.select([index for index in indices if index % config.hold_out_every])
+        held_out = samples.select(indices[::every])
+        samples = samples.select([index for index in indices if index % every])
     keep = partial(keep_sound, skip_broken=config.skip_broken, skip_unlabelled=config.skip_unlabelled)
     samples, broken = keep(samples, "training")
     problems = list(broken.values())
     if held_out is not None:
         held_out, broken = keep(held_out, "validation")
         problems += broken.values()
-    num_held_out = len(held_out) if held_out is not None else 0
-    logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))
+    logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), len(held_out or ()), len(problems))
     if problems:
         claim_folder(config.output, OUTPUT)
         write_text_whole(config.output / "broken_samples.txt", "\n".join(problems) + "\n")
@@ -153,7 +148,11 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
 def run_epochs(run: Run, state: TrainingState) -> None:
     """Train and evaluate until the last epoch; the first process writes the files."""
     if run.processes.is_first:
-        open_files(run, state)
+        output = run.config.output
+        claim_folder(output, OUTPUT)
+        sweep_folder(output)
+        write_text_whole(output / "config.yaml", yaml.safe_dump(config_values(run.config), sort_keys=False))
+        cut_log(output / "log.jsonl", state.step)
     network: nn.Module = state.model
     if run.processes.count > 1:
         network = DistributedDataParallel(state.model)
@@ -234,13 +233,12 @@ def not_finite(what: str, run: Run, state: TrainingState, indices: list[int]) ->
 def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
     """This process's chunks of all steps from `first_step` to the end of the run, read and augmented by workers."""
     config = run.config
-    keys = []
+    keys, size = [], config.images_per_forward
     for epoch in range(first_step // run.steps_per_epoch, config.epochs):
         batches = order_epoch(run.epoch_size, config.batch_size, seed=config.seed, epoch=epoch)
         for batch in batches[max(0, first_step - epoch * run.steps_per_epoch) :]:
             for number in range(run.processes.rank, config.num_chunks, run.processes.count):
-                chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
-                keys.append([(epoch, index) for index in chunk])
+                keys.append([(epoch, index) for index in batch[number * size : (number + 1) * size]])
     loader = DataLoader(
         AugmentedSamples(run.samples, run.config),
         batch_sampler=keys,
@@ -275,16 +273,22 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
     return average_precision(processes.gather(truth), processes.gather(detections), len(run.held_out))
 
 
+@torch.no_grad()
+def detect_and_label(model: MaskRCNN, samples: SampleList, indices: Iterable[int]) -> tuple[Annotations, Annotations]:
+    """Truth and detections (with "score") of those samples as COCO annotations without ids; the index is `image_id`.
+    The model is in eval mode; photos go to the device of its parameters. Raises InputError: a sample cannot be read."""
+    device = next(model.parameters()).device
+    truth: Annotations = []
+    detections: Annotations = []
+    for index in indices:
+        labelled = read_sample(samples.samples[index])
+        truth += annotate_truth(labelled, index, len(samples.categories))
+        photo = (labelled.photo.float() / 255).to(device)
+        detections += annotate_detections(*detect(model, photo), index)
+    return truth, detections
+
+
 # --- files of the run
-
-
-def open_files(run: Run, state: TrainingState) -> None:
-    """Write the config, and cut the log to the state's step."""
-    output = run.config.output
-    claim_folder(output, OUTPUT)
-    sweep_folder(output)
-    write_text_whole(output / "config.yaml", yaml.safe_dump(config_values(run.config), sort_keys=False))
-    cut_log(output / "log.jsonl", state.step)
 
 
 def cut_log(path: Path, step: int) -> None:
@@ -315,7 +319,7 @@ def close_epoch(run: Run, state: TrainingState) -> None:
         "finished": len(state.history) == config.epochs,
         "num_parameters": count_parameters(state.model),
         "num_training_samples": run.epoch_size,
-        "num_validation_samples": 0 if run.held_out is None else len(run.held_out),
+        "num_validation_samples": len(run.held_out or ()),
         "epochs": state.history,
     }
     write_text_whole(output / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")

@@ -128,16 +128,9 @@ def _read_background(path: Path) -> NDArray[np.uint8]:
 
 
 def recolor(photo: Tensor, layers: Tensor, background: Tensor) -> Tensor:
-    """Colour the leaves of a grey photo, such as chlorophyll fluorescence, and put them on a background.
-
-    Args:
-        photo: (3, H, W) uint8; its brightness becomes that of the leaves.
-        layers: (L, H, W) int, k where instance k is.
-        background: (3, H, W) uint8, seen wherever no leaf is.
-
-    Returns:
-        (3, H, W) uint8. Drawn from torch's global generator.
-    """
+    """Colour the leaves of a grey photo (3, H, W) uint8, such as chlorophyll fluorescence, and put them on a background
+    (3, H, W) uint8. Its brightness becomes that of the leaves; `layers` (L, H, W) int are k where instance k is. Drawn
+    from torch's global generator."""
     labels = layers.amax(0).long()
     grey = photo.float().amax(0)
     bright = grey[labels > 0].quantile(0.9).clamp(min=1) if bool((labels > 0).any()) else grey.new_tensor(255.0)

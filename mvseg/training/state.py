@@ -6,6 +6,7 @@ import copy
 import itertools
 import logging
 import math
+from collections import defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -63,9 +64,8 @@ def start_state(
     """
     checkpoint = config.output / "checkpoint.pt"
     if checkpoint.is_file() and not config.resume:
-        raise InputError(
-            f"{config.output} holds the checkpoint of an earlier run, expected --resume true or another output"
-        )
+        what = "holds the checkpoint of an earlier run"
+        raise InputError(f"{config.output} {what}, expected --resume true or another output")
     torch.manual_seed(config.seed)
     if model is None:
         weights = config.weights and str(find_weights(config.weights) or config.weights)
@@ -111,8 +111,7 @@ def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
 
 def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
     """Put a checkpoint's content into a fresh state. Raises InputError: it has another config, or other samples."""
-    difference = config_difference(saved["config"], config_values(config))
-    if difference:
+    if difference := config_difference(saved["config"], config_values(config)):
         raise InputError(f"the checkpoint in {config.output} was made with another {difference}, expected the same")
     if saved["samples"] != [sample.name for sample in samples.samples]:
         raise InputError(f"the checkpoint in {config.output} was made with other training samples, expected the same")
@@ -143,18 +142,15 @@ def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -
 def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimizer:
     """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out. Each group of
     parameters has a "factor" of the learning rate beside torch's own options."""
-    groups = []
-    for factor in sorted({1.0, config.backbone_lr}):
-        for is_decayed in (True, False):
-            group = [
-                parameter
-                for name, parameter in model.named_parameters()
-                if parameter.requires_grad
-                and (parameter.ndim > 1) == is_decayed
-                and (config.backbone_lr if name.startswith("backbone.body.") else 1.0) == factor
-            ]
-            decay = config.weight_decay if is_decayed else 0.0
-            groups += [{"params": group, "weight_decay": decay, "factor": factor}] if group else []
+    members: dict[tuple[float, bool], list[nn.Parameter]] = defaultdict(list)
+    for name, parameter in model.named_parameters():
+        if parameter.requires_grad:
+            factor = config.backbone_lr if name.startswith("backbone.body.") else 1.0
+            members[factor, parameter.ndim < 2].append(parameter)
+    decay, groups = {False: config.weight_decay, True: 0.0}, []
+    for factor, is_spared in sorted(members):
+        group = members[factor, is_spared]
+        groups.append({"params": group, "weight_decay": decay[is_spared], "factor": factor})
     if config.optimizer == "adamw":
         return torch.optim.AdamW(groups, lr=config.lr, fused=True)
     return torch.optim.SGD(groups, lr=config.lr, momentum=0.9)
@@ -189,20 +185,13 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
     state.optimizer.step()
     if state.averaged is not None:  # torch's AveragedModel would copy the first weights, and rename them
         decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))
-        update_average(state.averaged, state.model, decay=decay)
+        # Running statistics of a live BatchNorm belong to the weights that they were measured with: averaged, too.
+        models = (state.averaged, state.model)
+        here, there = (itertools.chain(each.parameters(), each.buffers()) for each in models)
+        for average, current in zip(here, there, strict=True):
+            if average.is_floating_point():
+                average.lerp_(current, 1 - decay)
+            else:  # numbers of tracked batches
+                average.copy_(current)
     state.step += 1
     return True
-
-
-def update_average(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
-    """Move an average a share of 1 - `decay` towards the model: its parameters, and its buffers with them.
-
-    The running statistics of a live BatchNorm belong to the weights that they were measured with, so they are averaged
-    over the same steps, and not copied. Integers (numbers of tracked batches) are copied.
-    """
-    here, there = (itertools.chain(each.parameters(), each.buffers()) for each in (averaged, model))
-    for average, current in zip(here, there, strict=True):
-        if average.is_floating_point():
-            average.lerp_(current, 1 - decay)
-        else:
-            average.copy_(current)

@@ -44,7 +44,7 @@ class ViewPicture:
         return np.where((self.rows < 0) & ~has_leaf_color(self.photo, colors), OTHER, self.rows)
 
 
-def label_views(masks: Masks, photos: ReadPhoto) -> list[tuple[Labels, int]]:
+def picture_views(masks: Masks, photos: ReadPhoto) -> list[tuple[Labels, int]]:
     """V pictures of D masks, see `ViewPicture.show`, by the colours of the matched ones; and the step of each."""
     views = _thin(masks, photos)
     colors = _colors_of(masks, views)
@@ -70,7 +70,7 @@ def _colors_of(masks: Masks, views: list[ViewPicture]) -> Bools:
 
 def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
     """Share of the leaf-coloured area that is in no mask of a leaf; 0 without any."""
-    pictures = label_views(masks.select(masks.instance_ids > 0), photos)
+    pictures = picture_views(masks.select(masks.instance_ids > 0), photos)
     pixels = np.concatenate([rows.ravel() for rows, _ in pictures])
     return float((pixels == FREE).sum() / max((pixels != OTHER).sum(), 1))
 

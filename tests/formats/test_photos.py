@@ -17,8 +17,16 @@ from PIL import Image
 from mvseg.errors import InputError
 from mvseg.formats import photos as photos_module
 from mvseg.formats.image_file import read_image_size, read_rgb
-from mvseg.formats.photo_content import measure_content
-from mvseg.formats.photos import Photo, Photos, build_scene, check_photos, load_photos, read_photo, view_names
+from mvseg.formats.photos import (
+    Photo,
+    Photos,
+    build_scene,
+    check_photos,
+    load_photos,
+    measure_content,
+    read_photo,
+    view_names,
+)  # fmt: skip
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files

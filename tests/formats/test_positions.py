@@ -22,19 +22,18 @@ from mvseg.formats.positions import read_positions
 def test_tables(tmp_path: Path, text: str, unit: str) -> None:
     path = tmp_path / "log.csv"
     path.write_bytes(text.encode())
-    positions = read_positions(path)
-    assert positions.names == ("a.jpg", "b.jpg")
-    assert positions.unit == unit
-    np.testing.assert_array_equal(positions.xyz, [[1, 2, 3], [4, 5, 6.5]])
+    names, xyz, stated = read_positions(path)
+    assert (names, stated) == (["a.jpg", "b.jpg"], unit)
+    np.testing.assert_array_equal(xyz, [[1, 2, 3], [4, 5, 6.5]])
 
 
 def test_json_of_a_robot(tmp_path: Path) -> None:
     place = {"x_mm": 75.5, "y_mm": 375, "z_mm": 80, "pan_deg": 270}
     views = [{"file": f"images/{name}.jpg", **place} for name in "ab"]
     (tmp_path / "poses.json").write_text(json.dumps({"note": "", "views": views}))
-    positions = read_positions(tmp_path / "poses.json")
-    assert (positions.names, positions.unit) == (("images/a.jpg", "images/b.jpg"), "mm")
-    np.testing.assert_array_equal(positions.xyz, [[75.5, 375, 80]] * 2)
+    names, xyz, unit = read_positions(tmp_path / "poses.json")
+    assert (names, unit) == (["images/a.jpg", "images/b.jpg"], "mm")
+    np.testing.assert_array_equal(xyz, [[75.5, 375, 80]] * 2)
 
 
 @pytest.mark.parametrize(

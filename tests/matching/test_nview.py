@@ -16,7 +16,6 @@ from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.numbers import COSTS, EM, NVIEW, SWEEP
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.nview.hypothesis_index import index_hypotheses, pack_views
 from mvseg.matching.nview.initialisation import em_affinities
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.plane_sweep import (
@@ -24,6 +23,8 @@ from mvseg.matching.nview.plane_sweep import (
     OUTSIDE,
     PlaneSweep,
     blocks_of_runs,
+    index_hypotheses,
+    pack_views,
     rays_per_region,
     run_starts,
     sweep_dilated,

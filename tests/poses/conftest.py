@@ -12,9 +12,8 @@ from mvseg.formats.board import Family
 from mvseg.formats.markers import Seen, find_scene_markers
 from mvseg.formats.photos import Photos
 from mvseg.poses.config import PoseConfig
-from mvseg.poses.mapping import Structure, find_structure
+from mvseg.poses.mapping import IMAGES, Structure, find_structure, write_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
-from mvseg.poses.scene_files import IMAGES, write_structure
 from mvseg.scene import Cameras, Scene
 from room_scene import BOARD, room_cameras, write_room
 from watched_stages import watch_stages

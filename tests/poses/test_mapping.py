@@ -19,10 +19,9 @@ from mvseg.formats.rig import read_rig
 from mvseg.poses import features, mapping
 from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import PoseConfig
-from mvseg.poses.mapping import find_structure
+from mvseg.poses.mapping import IMAGES, find_structure, move_structure, write_cameras, write_structure
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
-from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
 from room_scene import FOCAL, HEIGHT, WIDTH, draw_room, room_cameras, texture
 from watched_stages import watch_stages
 
@@ -122,7 +121,7 @@ def test_a_backdrop_that_stays_matches_nothing(tmp_path: Path) -> None:
         write_png(tmp_path / name, np.clip(photo + rng.normal(size=photo.shape) * 2, 0, 255).astype(np.uint8))
         photos.append(PhotoFile(name, WIDTH, HEIGHT))
     database, numbered = tmp_path / "photos.db", features.number_photos(tmp_path, photos, tmp_path / "numbered")
-    features.make_database(database, tmp_path / "numbered", numbered, config=PoseConfig())
+    features.make_database(database, tmp_path / "numbered", numbered, config=PoseConfig(), lens=None)
     features.find_features(database, tmp_path / "numbered", list(numbered), image_size=WIDTH)
     features.match_features(database, list(numbered), [(0, 1)])
     with pycolmap.Database.open(database) as opened:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from blade_scene import ring_cameras
 from mvseg.reconstruction.numbers import RAYS
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, nearest_point
 
 
 def scattered(num_views: int, seed: int) -> Cameras:
@@ -27,7 +27,7 @@ def scattered(num_views: int, seed: int) -> Cameras:
 
 def crowding(cameras: Cameras, chosen: tuple[int, ...]) -> float:
     """The sum of 1 / (d^2 + `RAYS.same`^2) over pairs of chosen directions, in plain loops."""
-    target = cameras.nearest_point(torch.arange(len(cameras)), cameras.R[:, 2])
+    target = nearest_point(cameras.centers, cameras.R[:, 2])
     ways = [(center - target) / (center - target).norm() for center in cameras.centers]
     pairs = combinations(chosen, 2)
     return sum(1 / (float(((ways[i] - ways[j]) ** 2).sum()) + RAYS.same**2) for i, j in pairs)

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
-from mvseg.errors import InputError
 from mvseg.simulation.cameras import FRAME_FILL, arc_cameras
 from mvseg.simulation.growth import SimulatedPlant, grow_plant
 
@@ -48,18 +45,3 @@ def test_ring_has_no_camera_twice_and_one_view_is_enough(plant: SimulatedPlant) 
     gaps = torch.cdist(ring.centers, ring.centers) + 1e9 * torch.eye(4, dtype=torch.float64)
     assert gaps.min() == pytest.approx(gaps[0, 1].item())
     assert len(arc_cameras(1, plant)) == 1
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"num_views": 0}, "0 views"),
-        ({"span_deg": 0.0}, "spans 0"),
-        ({"span_deg": 361.0}, "spans 361"),
-        ({"elevations_deg": ()}, "elevations"),
-        ({"elevations_deg": (90.0,)}, "elevations"),
-    ],
-)
-def test_impossible_arcs_are_refused(plant: SimulatedPlant, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        arc_cameras(**{"num_views": 3, "plant": plant, **changes})

@@ -8,7 +8,6 @@ import trimesh
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from mvseg.errors import InputError
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant, grow_plant, grow_shoots
 
@@ -89,17 +88,3 @@ def test_the_seed_decides_everything(family: str) -> None:
 def test_leaves_of_one_plant_differ() -> None:
     leaves = grow_plant("ovate", 12, 0).leaves
     assert len({round(leaf.area, 6) for leaf in leaves}) == 12
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("cactus", 3, 0), "unknown plant family 'cactus'"),
-        (("ovate", 0, 0), "0 leaves"),
-        (("ovate", 65, 0), "65 leaves"),
-        (("ovate", 3, -1), "seed is -1"),
-    ],
-)
-def test_wrong_arguments_are_named(arguments: tuple[str, int, int], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        grow_plant(*arguments)

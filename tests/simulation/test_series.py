@@ -50,12 +50,6 @@ def test_pots_are_turned_rigidly_and_the_same_seed_gives_the_same_series() -> No
     assert draw_pots(SPEC)[0] == PotPlace()
 
 
-@pytest.mark.parametrize("wrong", [{"family": "oak"}, {"leaves": (0, 2)}, {"times": (1.0, 1.0)}])
-def test_wrong_specs_are_refused(wrong: dict[str, object]) -> None:
-    with pytest.raises(InputError):
-        replace(SPEC, **wrong)
-
-
 def test_scenes_and_truth_over_time_are_written(tmp_path: Path) -> None:
     spec = replace(SPEC, times=(0.0, 4.0), num_views=(2, 3), size=(96, 96))
     write_series(tmp_path / "series", [spec])

@@ -50,23 +50,21 @@ def test_leaves_show_their_skin_where_it_lies_on_the_blade() -> None:
     skin = np.zeros((11, 5, 3), np.float32)
     skin[..., 0], skin[..., 1] = np.linspace(0, 1, 11)[:, None], np.linspace(0, 1, 5)
     uv = np.array([[0.0, -1.0], [0.5, 0.0], [1.0, 1.0], [0.25, 0.5]], np.float32)
-    albedo, _, _ = leaf_color(
-        replace(look, skin=skin), np.ones(4, np.uint16), uv, dryness=np.zeros(4, np.float32), has_parallel_veins=False
-    )
+    albedo, _, _ = leaf_color(replace(look, skin=skin), np.ones(4, np.uint16), uv, dryness=np.zeros(4, np.float32))
     assert np.allclose(albedo[:, 0], uv[:, 0], atol=1e-5)
     assert np.allclose(albedo[:, 1], (uv[:, 1] + 1) / 2, atol=1e-5)
 
 
 def test_a_marking_colours_what_lies_near_veins_and_nothing_else() -> None:
-    look = replace(draw_look(np.random.default_rng(1)), leaf_spread=0.0, spots=-100.0)
+    look = replace(draw_look(np.random.default_rng(1), has_parallel_veins=True), leaf_spread=0.0, spots=-100.0)
     white = np.ones(3, np.float32)
     marked = replace(look, marking=Marking(color=white, vein=1.0, blotch=0.0, edge=0.0, bias=0.0))
     v = np.linspace(-1, 1, 41, dtype=np.float32)
     uv = np.stack([np.full_like(v, 0.01), v], 1)
     args = (np.ones(41, np.uint16), uv)
     dry = np.zeros(41, np.float32)
-    plain, _, _ = leaf_color(look, *args, dryness=dry, has_parallel_veins=True)
-    albedo, _, _ = leaf_color(marked, *args, dryness=dry, has_parallel_veins=True)
+    plain, _, _ = leaf_color(look, *args, dryness=dry)
+    albedo, _, _ = leaf_color(marked, *args, dryness=dry)
     assert np.allclose(albedo[20], white, atol=1e-5)  # the midrib
     changed = np.abs(albedo - plain).max(1)
     assert changed.min() < 0.01

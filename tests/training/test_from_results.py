@@ -21,8 +21,7 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import stack_regions
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
-from mvseg.training.data import read_sample
-from mvseg.training.from_results import list_results
+from mvseg.training.data import list_results, read_sample
 from scene_folders import edit_rig
 from tiny_training import make_config
 

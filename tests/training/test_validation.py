@@ -8,7 +8,7 @@ import torch
 
 from mvseg.detectors.run import detect
 from mvseg.training.data import list_samples, read_sample
-from mvseg.training.validation import detect_and_label
+from mvseg.training.loop import detect_and_label
 from tiny_training import build_tiny, write_photos
 
 

@@ -23,7 +23,6 @@ PHOTO = 50  # chosen: numbers of a label image: with more, it may be a photo
 # at most (0.08 in the worst photo, of a seedling); those that OpenCV scaled by 0.25 to 4 have 0.13 to 0.58.
 BETWEEN = 0.1
 FEWEST = 500  # chosen: pixels at edges of all photos, below which that share means nothing
-BAND = 1024  # limit: rows that are looked at together; neighbours across are not
 
 
 def check_numbers(regions: Regions, between: np.ndarray, *, source: object) -> None:
@@ -62,17 +61,13 @@ def count_between(labels: np.ndarray) -> np.ndarray:
     """(2,) int64, of a label map (H, W) uint16: the pixels at edges, which have a neighbour (of 8) of another number;
     and those of them that have one of a lower number and one of a higher one. There are a few where three leaves meet,
     and many along all edges where a label image was scaled with interpolation."""
-    counts = np.zeros(2, np.int64)
-    for top in range(0, len(labels), BAND):
-        band = labels[top : top + BAND]
-        columns = np.flatnonzero(band.any(0))
-        if not len(columns):
-            continue
-        band = band[:, max(columns[0] - 1, 0) : columns[-1] + 2]
-        band = np.where(band == IGNORE_LABEL, 0, band).astype(np.uint16)
-        low, high = minimum_filter(band, 3, mode="nearest"), maximum_filter(band, 3, mode="nearest")  # without threads
-        counts += [np.count_nonzero(low != high), np.count_nonzero((low < band) & (band < high))]
-    return counts
+    rows, columns = (np.flatnonzero(labels.any(axis)) for axis in (1, 0))
+    if not len(rows):
+        return np.zeros(2, np.int64)
+    part = labels[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
+    part = np.where(part == IGNORE_LABEL, 0, part).astype(np.uint16)
+    low, high = minimum_filter(part, 3, mode="nearest"), maximum_filter(part, 3, mode="nearest")  # without threads
+    return np.array([np.count_nonzero(low != high), np.count_nonzero((low < part) & (part < high))])
 
 
 def is_interpolated(between: np.ndarray) -> bool:

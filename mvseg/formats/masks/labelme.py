@@ -62,10 +62,8 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
         counts[key] += 1
         earlier = parts.get(key)
         parts[key] = mask if earlier is None else earlier if mask is None else earlier | mask
-    return [
-        FoundMask(number, mask, key[0], num_parts=counts[key])
-        for number, (key, mask) in enumerate(parts.items(), start=1)
-    ]
+    numbered = enumerate(parts.items(), start=1)
+    return [FoundMask(number, mask, key[0], num_parts=counts[key]) for number, (key, mask) in numbered]
 
 
 @np.errstate(over="ignore", invalid="ignore")  # absurd corners become infinite, which the codec refuses
@@ -103,6 +101,4 @@ def _paste(text: str, points: np.ndarray, *, width: int, height: int) -> np.ndar
     left, top = np.round(points.min(0)).astype(int).tolist()
     if crop.ndim != 2 or left < 0 or top < 0 or left + crop.shape[1] > width or top + crop.shape[0] > height:
         raise InputError("its mask does not lie in the photo")
-    mask = np.zeros((height, width), bool)
-    mask[top : top + crop.shape[0], left : left + crop.shape[1]] = crop
-    return mask
+    return np.pad(crop, ((top, height - top - crop.shape[0]), (left, width - left - crop.shape[1])))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +22,10 @@ from mvseg.formats.masks.view_regions import ViewMasks
 from mvseg.formats.masks.yolo import YOLO_TRACKS, read_class_names, read_yolo
 from mvseg.scene import Scene
 
+READERS: dict[str, Callable[[Path, int, int], np.ndarray | list[FoundMask]]] = {
+    "label images": read_label_image, "NumPy arrays": read_npy, "labelme": read_labelme, "SAM": read_sam,
+}  # fmt: skip
+
 
 def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
     """The masks of each view in turn, in the frame of its photo, see `stack_views`. Warns (InputWarning) at the end of
@@ -32,14 +36,14 @@ def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> It
     entries: list[FoundMask] = []
     if files.kind == YOLO_TRACKS:
         warn(Finding("confidence_and_track", str(files.source)))
-    for view in range(len(files.files)):
+    for view, paths in enumerate(files.files):
         try:
-            content = read_photo_masks(files.files[view], files.kind, scene.cameras.sizes[view].tolist())
+            content = read_photo_masks(paths, files.kind, scene.cameras.sizes[view].tolist())
         except InputError as error:
             turn = describe_turn(scene.views[view].path)
             raise InputError(f"{error} (view {view}{turn})") from None
         if isinstance(content, np.ndarray):
-            with faults_of(f"{files.files[view][0]} (view {view})"):
+            with faults_of(f"{paths[0]} (view {view})"):
                 num_borders += ignore_border(content)
             yield content
             continue
@@ -66,20 +70,12 @@ def read_photo_masks(paths: Sequence[Path], kind: str, size: Sequence[int]) -> n
     width, height = size
     if not paths:
         return []
-    match kind:
-        case "label images":
-            return read_label_image(paths[0], width, height)
-        case "NumPy arrays":
-            return read_npy(paths[0], width, height)
-        case "cellpose":
-            advice = "in cellpose, save the masks as PNG or TIFF (File menu, or --save_png)"
-            raise InputError(f"{paths[0]}: is a pickle, which may run anything when it is read; {advice}")
-        case "labelme":
-            return read_labelme(paths[0], width, height)
-        case "SAM":
-            return read_sam(paths[0], width, height)
-        case "YOLO" | "YOLO tracks":
-            names = read_class_names(paths[0].parent)
-            return read_yolo(paths[0], width, height, names=names, tracks=kind == YOLO_TRACKS)
-        case _:
-            return read_mask_images(paths, width, height)
+    if kind in READERS:
+        return READERS[kind](paths[0], width, height)
+    if kind == "cellpose":
+        advice = "in cellpose, save the masks as PNG or TIFF (File menu, or --save_png)"
+        raise InputError(f"{paths[0]}: is a pickle, which may run anything when it is read; {advice}")
+    if kind in ("YOLO", YOLO_TRACKS):
+        names = read_class_names(paths[0].parent)
+        return read_yolo(paths[0], width, height, names=names, tracks=kind == YOLO_TRACKS)
+    return read_mask_images(paths, width, height)

@@ -127,8 +127,7 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
         groups[ENDINGS[ending]][stem].append(path)
         if "label images" in ENDINGS[ending]:
             numbered = NUMBERED.match(stem)
-            photo = stem.rpartition("/")[0] or (numbered and numbered["photo"])
-            if photo:
+            if photo := stem.rpartition("/")[0] or (numbered and numbered["photo"]):
                 groups[ONE_PER_MASK][photo].append(path)
     return groups
 
@@ -148,8 +147,7 @@ def _fit(names: dict[str, list[Path]], scene: PhotoSet, folder: Path, *, kind: s
         claimed = by_base.get(base_name(stem)) if view is None else view
         if claimed is not None and (name == scene.views[claimed].name or scene.views[claimed].name not in names):
             files[claimed] += paths
-    several = next((paths for paths in files if len(paths) > 1 and kind != ONE_PER_MASK), None)
-    if several:
+    if several := next((paths for paths in files if len(paths) > 1 and kind != ONE_PER_MASK), None):
         first, second = (path.relative_to(folder).as_posix() for path in several[:2])
         problem = f"both {first} and {second} fit one photo, expected the folder of one of them"
     if problem:
@@ -162,8 +160,7 @@ def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> File
     if kind in COMPLETE:
         ending = next(ending for ending, each in ENDINGS.items() if each == kind)
         return tuple(paths or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
-    missing = [f"view {view} ({scene.views[view].name})" for view, paths in enumerate(files) if not paths]
-    if missing:
+    if missing := [f"view {view} ({scene.views[view].name})" for view, paths in enumerate(files) if not paths]:
         warn(Finding("files_missing", str(folder), {"count": len(missing), "first": missing[0]}))
     return files
 

@@ -19,11 +19,11 @@ def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         expected = "expected labelme's (shapes) or Segment Anything's (annotations, or a list of masks)"
         raise InputError(f"{path}: is JSON of another form, {expected}")
+    segmentations = [entry.get("segmentation") for entry in entries]
     with faults_of(path):
-        check_segmentations((entry.get("segmentation"), (width, height)) for entry in entries)
+        check_segmentations((each, (width, height)) for each in segmentations)
     masks = []
-    for number, entry in enumerate(entries, start=1):
-        segmentation = entry.get("segmentation")
+    for number, segmentation in enumerate(segmentations, start=1):
         with faults_of(f"{path}: mask {number}"):
             mask = None if segmentation in (None, []) else decode_segmentation(segmentation, width, height)
         masks.append(FoundMask(number, mask))

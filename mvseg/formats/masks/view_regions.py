@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 import pycolmap
@@ -11,15 +11,17 @@ from torch import Tensor
 
 from mvseg.crop import Box, Crop
 from mvseg.errors import InputError, warn
-from mvseg.findings.finding import Finding, list_findings
+from mvseg.findings.finding import Finding, Rule, list_findings
 from mvseg.formats.lens import undistort
 from mvseg.formats.masks.class_numbers import check_numbers, count_between
-from mvseg.formats.masks.faults import mask_faults
 from mvseg.regions import Regions, label_boxes, stack_regions
 from mvseg.scene import Scene
 
 ViewMasks = np.ndarray | Iterable[tuple[int, np.ndarray]]
 SAME = 0.75  # definition: IoU of two masks of one object; that of 20 x 8 pixels, moved by one along both sides, has it
+COVERS = 0.8  # chosen: of the photo: the background
+INSIDE = 0.9  # chosen: share of a mask that lies in a larger one, from which it is a part of that
+MANY = 0.2  # chosen: share of the masks that are such parts, above which they are no leaves that hide each other
 Cropped = tuple[int, Box | None, np.ndarray]  # number, box (None: no pixel), and the pixels (h, w) bool in the box
 
 
@@ -79,7 +81,7 @@ def stack_views(
 def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
     label_map = undistort(labels, lens, K)
     boxes = label_boxes(label_map)
-    for number in sorted(boxes if lens is None else label_boxes(labels)):
+    for number in boxes if lens is None else label_boxes(labels):
         x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 0, 0))
         yield number, box if number in boxes else None, label_map[y1:y2, x1:x2] == number
 
@@ -112,3 +114,22 @@ def _say_left_out(num_kept: int, num_empty: int, num_twice: int, *, source: obje
         warn(Finding("masks_without_pixels", str(source), {"count": num_empty}))
     if num_twice:
         warn(Finding("masks_twice", str(source), {"count": num_twice, "total": num_kept + num_twice}))
+
+
+def mask_faults(regions: Regions, sizes: Sequence[Sequence[int]]) -> list[Rule]:
+    """The faults of the masks of V views of these sizes (width and height, pixels)."""
+    counts = regions.num_per_view.cpu().numpy()
+    if not counts.any():
+        return [("no_masks", "error", None, {})]
+    faults: list[Rule] = []
+    if np.count_nonzero(counts) < 2:
+        faults.append(("masks_in_one_view", "error", np.flatnonzero(counts == 0).tolist(), {}))
+    areas, views = regions.areas.tolist(), regions.view_index.tolist()
+    whole = {view for view, area in zip(views, areas, strict=True) if area > COVERS * sizes[view][0] * sizes[view][1]}
+    faults.append(("background_mask", "error", sorted(whole), {"share": COVERS}))
+    inside = [pair for *pair, shared in regions.overlaps() if shared >= INSIDE * min(areas[row] for row in pair)]
+    parts = {min(pair, key=lambda row: areas[row]) for pair in inside}
+    if len(parts) > MANY * len(areas):
+        values = {"count": len(parts), "total": len(areas)}
+        faults.append(("masks_inside_masks", "error", sorted({views[row] for row in parts}), values))
+    return faults

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from mvseg.arrays import Ints, Reals
 from mvseg.matching.numbers import COSTS, GAINS, SEARCH
-from mvseg.matching.nview.hypothesis_index import pack_views
-from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, run_starts
+from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, pack_views, run_starts
 from mvseg.matching.partition import Clusters, members_of
 from mvseg.matching.view_graph import ViewGraph
 
@@ -104,8 +103,9 @@ class ClusterScores:
     def value(self, clusters: Clusters) -> float:
         """Value of a partition: the scores of all regions that are not alone, and the epipolar evidence for all
         pairs in one cluster."""
-        pairs = self.pair_factor * float(self.graph.sum_partners(self.evidence, clusters).sum()) / 2
-        return float(self.own(clusters)[~clusters.is_alone].sum()) + pairs
+        pairs = float(self.graph.sum_partners(self.evidence, clusters).sum()) / 2
+        factor = GAINS.pair_factor(self.sweep.num_views)
+        return float(self.own(clusters)[~clusters.is_alone].sum()) + factor * pairs
 
     def explained(self, clusters: Clusters) -> float:
         """Mean score of the regions that are not alone in their cluster; 0 without any."""
@@ -131,13 +131,8 @@ class ClusterScores:
         coverage[:, has_coverage] = coverages[clusters[has_coverage], here].T
         evidence = self.evidence[here].take(np.concatenate([*members, clusters[:0]]), 1)
         pairs = np.add.reduceat(evidence, (sizes.cumsum() - sizes)[clusters], 1)
-        total = score + GAINS.coverage * coverage + self.pair_factor * pairs
+        total = score + GAINS.coverage * coverage + GAINS.pair_factor(self.sweep.num_views) * pairs
         return ViewGains(clusters, score, coverage, total)
-
-    @property
-    def pair_factor(self) -> float:
-        """Gain per unit of epipolar evidence for a pair, in this number of views."""
-        return GAINS.pair_factor(self.sweep.num_views)
 
     def _members_elsewhere(self, view: int, numbers: Ints) -> list[Ints]:
         elsewhere = np.where(self.sweep.view_index == view, -1, numbers)
@@ -284,7 +279,6 @@ def best_elsewhere(
 
 
 def _look_up(cache: dict[Key, Reals], keys: list[Key], compute: Callable[[list[int]], Iterable[Reals]]) -> list[Reals]:
-    new = [place for place, key in enumerate(keys) if key not in cache]
-    if new:
+    if new := [place for place, key in enumerate(keys) if key not in cache]:
         cache.update(zip((keys[place] for place in new), compute(new), strict=True))
     return [cache[key] for key in keys]

@@ -113,13 +113,9 @@ def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
     named = np.column_stack((owner, np.sort(named, 1)))
     num_labels = (named < num).sum(1)
     order = np.argsort(-num_labels, kind="stable")
-    return _ComparedHypotheses(
-        labels=np.ascontiguousarray(named[order, : int(num_labels.max())].T),
-        num_labels=num_labels[order],
-        order=order,
-        num_empty=(labels == EMPTY).sum(1)[order],
-        num_inside=(labels >= EMPTY).sum(1)[order],
-    )
+    named, num_labels = np.ascontiguousarray(named[order, : int(num_labels.max())].T), num_labels[order]
+    empty, inside = (labels == EMPTY).sum(1)[order], (labels >= EMPTY).sum(1)[order]
+    return _ComparedHypotheses(labels=named, num_labels=num_labels, order=order, num_empty=empty, num_inside=inside)
 
 
 def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Reals:

@@ -3,7 +3,7 @@
 Pairs of views cannot tell apart leaves that share their epipolar lines; a third view can. What the views show along the
 rays of each region (`plane_sweep.py`) gives initial partitions (`initialisation.py`); the search (`search.py`) improves
 them by how well clusters explain all views (`cluster_scores.py`); what shares a photo with its leaf and is likelier a
-stranger than a piece leaves (`pieces.py`); then every id gets a probability (`match_scores.py`).
+stranger than a piece leaves; then every id gets a probability (`match_scores.py`).
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.special import expit
 
+from mvseg.arrays import Ints, Reals
 from mvseg.masks import Masks
-from mvseg.matching.numbers import NVIEW
+from mvseg.matching.numbers import NVIEW, PIECES
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
-from mvseg.matching.nview.pieces import part_pieces
-from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
+from mvseg.matching.nview.plane_sweep import rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.partition import Clusters
@@ -27,14 +28,14 @@ from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
+# Several masks of one photo in one cluster are pieces of one leaf, or a leaf and a stranger: a leaf that only one photo
+# shows fits another leaf along its rays. So a second mask of one photo must be as likely a piece as this scene's masks
+# are in pieces, and explained by the cluster nearly as well as the first.
+# fitted: python benchmarks/pieces.py: weights of the columns of `piece_features`, in their order.
+PIECE = {"always": 1.28, "other pieces": 0.84, "score": 3.69, "coverage": 4.37, "weight": -3.93}
 
-def match_nview(
-    regions: Regions,
-    cameras: Cameras,
-    graph: ViewGraph,
-    *,
-    residual_px: int | None = None,
-) -> Matching:
+
+def match_nview(regions: Regions, cameras: Cameras, graph: ViewGraph, *, residual_px: int | None = None) -> Matching:
     """Match D regions of V >= 2 views, in any order, by what all views show.
 
     Args:
@@ -58,12 +59,10 @@ def match_nview(
         explained=best.scores.explained(clusters),
         view_explained=torch.from_numpy(best.scores.explained_per_view(clusters)).float().to(regions.device),
     )
-    probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
-    masks = Masks.of(ordered.to("cpu"), clusters.instance_ids(), probabilities)
-    masks = masks.select(order.argsort().cpu())
-    ids = masks.instance_ids.numpy()
-    final = Clusters.of(ids).drop_singletons().instance_ids()[torch.from_numpy(np.unique(ids, return_index=True)[1])]
-    return Matching(replace(masks.relabel(final).to(regions.device), regions=regions), report)
+    back = order.argsort().cpu().numpy()
+    ids = Clusters.of(clusters.ids[back]).drop_singletons().instance_ids().to(regions.device)
+    probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)[back]).float().to(regions.device)
+    return Matching(Masks.of(regions, ids, probabilities * (ids > 0)), report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +84,7 @@ class FoundClusters:
 
 
 def find_clusters(
-    regions: Regions,
-    cameras: Cameras,
-    graph: ViewGraph,
-    *,
-    residual_px: int | None = None,
+    regions: Regions, cameras: Cameras, graph: ViewGraph, *, residual_px: int | None = None
 ) -> FoundClusters:
     """The clusters of D regions, ordered by view, that explain all views best, or where hypotheses explain too little,
     those from the weights alone. `residual_px`: see `match_nview`."""
@@ -110,30 +105,58 @@ def find_clusters(
 
 
 def select_dilation(
-    regions: Regions,
-    cameras: Cameras,
-    graph: ViewGraph,
-    *,
-    pairwise: Clusters,
-    residual_px: int | None = None,
+    regions: Regions, cameras: Cameras, graph: ViewGraph, *, pairwise: Clusters, residual_px: int | None = None
 ) -> tuple[ClusterScores, int]:
     """The scores of the plane sweep whose label maps are dilated by the reprojection error, and that error in pixels.
 
     The error is the least dilation with which the hypotheses explain the pairwise clusters nearly as well as with any;
     all dilations but the first are tried on a few rays of each region. A given `residual_px` is not estimated.
     """
+    dilation_px = residual_px or NVIEW.dilations[0]
+    scores = ClusterScores(sweep_planes(regions, cameras, dilation_px=dilation_px), graph)
+    explained = [scores.explained(pairwise)]
+    if residual_px is None and explained[0] < NVIEW.explained:
+        rays = min(rays_per_region(len(cameras)), -(-NVIEW.probe_rays // max(len(regions), 1)))
+        for sweep in sweep_dilated(regions, cameras, dilations=NVIEW.dilations[1:], rays=rays):
+            explained.append(ClusterScores(sweep, graph).explained(pairwise))
+        if best := int(np.argmax(np.array(explained) >= max(explained) - NVIEW.as_good)):
+            dilation_px = NVIEW.dilations[best]
+            scores = ClusterScores(sweep_planes(regions, cameras, dilation_px=dilation_px), graph)
+    return scores, dilation_px
 
-    def score(sweep: PlaneSweep) -> ClusterScores:
-        return ClusterScores(sweep, graph)
 
-    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or NVIEW.dilations[0]))
-    explained = [first.explained(pairwise)]
-    if residual_px is not None or explained[0] >= NVIEW.explained:
-        return first, residual_px or NVIEW.dilations[0]
-    rays = min(rays_per_region(len(cameras)), -(-NVIEW.probe_rays // max(len(regions), 1)))
-    for sweep in sweep_dilated(regions, cameras, dilations=NVIEW.dilations[1:], rays=rays):
-        explained.append(score(sweep).explained(pairwise))
-    best = int(np.argmax(np.array(explained) >= max(explained) - NVIEW.as_good))
-    if best == 0:
-        return first, NVIEW.dilations[0]
-    return score(sweep_planes(regions, cameras, dilation_px=NVIEW.dilations[best])), NVIEW.dilations[best]
+def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Reals]:
+    """Take strangers out of their clusters, so that they are alone; links of the user stay. Returns the clusters, those
+    of one region included, and (D,) float64: P(a remaining piece shows the leaf of its cluster); 1 for all others."""
+    chance = np.ones(len(clusters.ids))
+    rows, features = piece_features(scores, clusters)
+    chance[rows] = expit(features @ list(PIECE.values()))
+    leaves = (chance < PIECES.least) & ~scores.graph.is_joined
+    parted = np.where(leaves, len(clusters) + np.arange(len(leaves)), clusters.ids)
+    return Clusters.of(parted), np.where(leaves, 1.0, chance)
+
+
+def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Reals]:
+    """The P regions that are not the best one of their cluster in their view, by leave-one-out score.
+
+    Returns:
+        (P,) int64 rows, and (P, 5) float64: 1; the logarithm of the share of all other places (a cluster in a view)
+        that have several regions, half a place counted in any case; the score as a share of the best one's; the share
+        of the cluster's pixels in other views that show the region; and its mean epipolar weight to the members there,
+        which is low for a piece.
+    """
+    place = clusters.ids * scores.sweep.num_views + scores.sweep.view_index
+    count = np.bincount(place, minlength=1)
+    num_split, num_places = int((count > 1).sum()), len(np.unique(place[~clusters.is_alone]))
+    own = scores.own(clusters)
+    several = np.flatnonzero(count[place] > 1)
+    order = several[np.lexsort((several, -own[several], place[several]))]
+    is_best = np.diff(place[order], prepend=-1) != 0
+    best = order[is_best][is_best.cumsum() - 1]  # of the place of each
+    rows, best = order[~is_best], best[~is_best]
+    share = np.log((num_split - 0.5) / max(num_places, 1)) if len(rows) else 0.0
+    ratio = np.clip(own[rows] / np.maximum(own[best], PIECES.least_score), 0, 1)
+    coverage = np.clip(scores.coverages(clusters)[clusters.ids[rows], rows], 0, 1) if len(rows) else np.zeros(0)
+    partners = np.maximum(scores.graph.sum_partners(np.ones_like(scores.graph.weights), clusters), 1)
+    weight = scores.graph.sum_partners(scores.graph.weights, clusters) / partners
+    return rows, np.column_stack((np.ones(len(rows)), np.full(len(rows), share), ratio, coverage, weight[rows]))

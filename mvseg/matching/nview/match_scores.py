@@ -91,19 +91,17 @@ def _count_partners(clusters: Ints, view_index: Ints) -> tuple[Ints, Ints]:
 def features(evidence: IdEvidence) -> Reals:
     """(D, 8): 1, and what the probability depends on, clipped to the range seen on the development plants."""
     others = max(evidence.num_views - 1, 1)
-    return np.stack(
-        [
-            np.ones(len(evidence.score)),
-            np.clip(evidence.score, *SCORES),
-            np.clip(evidence.margin, *MARGINS),
-            np.clip(evidence.coverage, 0, 1),
-            np.clip(evidence.weight, 0, 1),
-            np.minimum(evidence.num_partners / others, 1),
-            1 / np.maximum(evidence.num_partners, 1),
-            evidence.num_fragments > 1,
-        ],
-        1,
-    )
+    columns = [
+        np.ones(len(evidence.score)),
+        np.clip(evidence.score, *SCORES),
+        np.clip(evidence.margin, *MARGINS),
+        np.clip(evidence.coverage, 0, 1),
+        np.clip(evidence.weight, 0, 1),
+        np.minimum(evidence.num_partners / others, 1),
+        1 / np.maximum(evidence.num_partners, 1),
+        evidence.num_fragments > 1,
+    ]
+    return np.stack(columns, 1)
 
 
 def scene_features(evidence: IdEvidence) -> Reals:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 
 import cv2
 import numpy as np
@@ -22,13 +22,60 @@ from torch import Tensor
 
 from mvseg.arrays import Ints
 from mvseg.matching.numbers import SWEEP
-from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses, pack_views
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
 # definition: labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
 EMPTY, OUTSIDE = -1, -2
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesesOfRegions:
+    """Index of R hypotheses by the D regions that they name.
+
+    Attributes:
+        hypotheses: int32, the hypotheses of region 0, then those of region 1, ...
+        offsets: D + 1 numbers: region d is named by `hypotheses[offsets[d]:offsets[d + 1]]`.
+    """
+
+    hypotheses: NDArray[np.int32]
+    offsets: list[int]
+    num_hypotheses: int
+
+    def count(self, clusters: list[Ints]) -> tuple[Ints, Ints, Ints]:
+        """Count the views that show a member of each of C clusters. Returns three int64 arrays with an entry per
+        cluster and hypothesis in which any view does, in this order: cluster, hypothesis, views."""
+        parts = [
+            [self.hypotheses[self.offsets[region] : self.offsets[region + 1]] for region in members.tolist()]
+            for members in clusters
+        ]
+        lengths = [sum(map(len, of_cluster)) for of_cluster in parts]
+        kind: type[np.int32 | np.int64] = np.int32 if len(clusters) * self.num_hypotheses < 2**31 else np.int64
+        first = np.arange(len(clusters)).astype(kind) * self.num_hypotheses  # of each cluster
+        cell = np.repeat(first, lengths)
+        if len(cell):
+            cell += np.concatenate(list(chain.from_iterable(parts)))
+        cell.sort()
+        start = run_starts(cell)
+        cell, views = cell[start], np.diff(start, append=len(cell))
+        cluster = np.repeat(np.arange(len(clusters)), np.diff(np.searchsorted(cell, first), append=len(cell)))
+        return cluster, cell - first[cluster], views
+
+
+def index_hypotheses(labels: NDArray[np.integer], num_regions: int) -> HypothesesOfRegions:
+    """The index of R hypotheses (R, V) by the regions that they name."""
+    flat = labels.ravel()
+    order = np.argsort(flat, kind="stable")  # of int16, a radix sort
+    offsets = np.searchsorted(flat[order], np.arange(num_regions + 1)).tolist()
+    hypotheses = (order // max(labels.shape[1], 1)).astype(np.int32)
+    return HypothesesOfRegions(hypotheses=hypotheses, offsets=offsets, num_hypotheses=len(labels))
+
+
+def pack_views(is_view: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """(W, N): sets of views (N, V) as bits, 64 of them in a word."""
+    packed = np.packbits(is_view, axis=1)
+    return np.pad(packed, ((0, 0), (0, -packed.shape[1] % 8))).view(np.uint64).T.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +144,7 @@ def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1) ->
 
 
 def sweep_dilated(
-    regions: Regions,
-    cameras: Cameras,
-    *,
-    dilations: Sequence[int],
-    rays: int | None = None,
+    regions: Regions, cameras: Cameras, *, dilations: Sequence[int], rays: int | None = None
 ) -> Iterator[PlaneSweep]:
     """The sweep of each of several dilations, in ascending order; see `sweep_planes`. `rays` of each region are swept,
     at most; None: `rays_per_region`."""
@@ -134,13 +177,9 @@ def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region
             pixel, label = _join_equal(*label_maps.hypotheses(view, xy[chunk]))
             pixels.append(pixel + int(chunk[0]))
             labels.append(np.ascontiguousarray(label.T))
-    return PlaneSweep(
-        labels=np.concatenate(labels),
-        pixel=np.concatenate(pixels),
-        pixel_region=region.numpy(),
-        view_index=regions.view_index.numpy(),
-        num_views=num_views,
-    )
+    pixel, owner, views = np.concatenate(pixels), region.numpy(), regions.view_index.numpy()
+    every = np.concatenate(labels)
+    return PlaneSweep(labels=every, pixel=pixel, pixel_region=owner, view_index=views, num_views=num_views)
 
 
 def _padded_labels(regions: Regions, view: int, size: list[int]) -> Tensor:
@@ -258,13 +297,11 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
     """(P * depths,) label at the projection of each sample."""
     height, width = labels.shape
     depth = torch.add(base[:, 2:], inverse, alpha=offset[2])
-    is_behind = depth <= 0 if float(depth.min()) <= 0 else None
+    is_behind = depth <= 0
     scale = depth.reciprocal_()
     column = torch.add(base[:, :1], inverse, alpha=offset[0]).mul_(scale).add_(1).clamp_(0, width - 1).int()
     row = torch.add(base[:, 1:2], inverse, alpha=offset[1]).mul_(scale).add_(1).clamp_(0, height - 1).int()
-    place = row.mul_(width).add_(column)
-    if is_behind is not None:
-        place.masked_fill_(is_behind, 0)  # the frame of the map is OUTSIDE
+    place = row.mul_(width).add_(column).masked_fill_(is_behind, 0)  # the frame of the map is OUTSIDE
     found: NDArray[np.integer] = labels.numpy().ravel().take(place.numpy().ravel())  # torch's look-up is slower
     return found
 

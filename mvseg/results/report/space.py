@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.result import Result
 from mvseg.results.stem_shapes import StemPart, parts_of
-from mvseg.scene import Cameras, Scene
+from mvseg.scene import Cameras, Scene, nearest_point
 from mvseg.traits.up import level_frame
 
 MESH_SHAPE = (24, 9)  # limit: grid of a surface: 352 triangles
@@ -104,7 +104,7 @@ def find_frame(scene: Scene, meshes: Mapping[int, trimesh.Trimesh]) -> Frame:
         middle = (points.min(0) + points.max(0)) / 2
         radius = float(np.linalg.norm(points - middle, axis=1).max())
     else:
-        target = cameras.nearest_point(torch.arange(len(cameras)), cameras.R[:, 2]).numpy()  # looked at by all
+        target = nearest_point(cameras.centers, cameras.R[:, 2]).numpy()  # looked at by all
         middle = rotation @ target
         radius = PLANT_SHARE * float(np.median(np.linalg.norm(cameras.centers.numpy() - target, axis=1)))
     return Frame(rotation=rotation, middle=middle, radius=max(radius, 1e-9), is_up_known=scene.up is not None)
