@@ -18,7 +18,6 @@ their place, single photos, or every n-th of them, answer the first question. Th
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections import Counter
@@ -233,7 +232,6 @@ def main() -> None:
     parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
     parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of detections in the loop")
     parser.add_argument("--iterations", type=int, default=3, help="of the loop at most; 0 for average precision alone")
-    parser.add_argument("--json", type=Path, help="write the figures here")
     args = parser.parse_args()
     if bool(args.scenes) == bool(args.photos) or bool(args.photos) != bool(args.labels):
         parser.error("expected either --scenes, or --photos and --labels")
@@ -247,14 +245,10 @@ def main() -> None:
     alone = average_precision(truth, detections, len(samples))
     alone |= count_and_dice(truth, detections, len(samples), min_score=args.min_score)
     alone["cpu_seconds_per_photo"] = seconds / len(samples)
-    print(json.dumps(alone))
-    report: dict[str, Any] = {"num_photos": len(samples), "detector": alone}
+    print(len(samples), "photos", alone)
     if args.scenes and args.iterations:
-        report["loop"] = measure_loop(args.scenes, args)
-        for row, values in report["loop"].items():
+        for row, values in measure_loop(args.scenes, args).items():
             print(f"{row:12}", "  ".join(f"{name} {value:.3f}" for name, value in values.items()))
-    if args.json:
-        args.json.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ one part of the N-view matcher at a time.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import sys
 import time
@@ -110,13 +109,10 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["symnmf", "one-per-view", "nview"])
     parser.add_argument("--ablate", action="store_true", help="one-per-view, nview, and nview minus one part at a time")
     parser.add_argument("--masks", nargs="+", choices=KINDS, default=KINDS)
-    parser.add_argument("--json", type=Path, help="write the records here")
     args = parser.parse_args()
     methods = ["one-per-view", "nview", *ABLATIONS] if args.ablate else args.methods
     work = partial(run_scene, cache=args.cache, methods=methods, kinds=args.masks)
     records = [record for of_scene in run_all(work, chosen_scenes(args), args.workers) for record in of_scene]
-    if args.json:
-        args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
     print_tables(records)
 
 

@@ -10,7 +10,7 @@ masks and of straps in pieces, and masks are cut; where the views choose what th
 folders of `--scenes`; and where up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos,
 or in three (half of their other masks are still there, matched to nothing). Of reconstruction, with the masks of
 `--masks`: of all leaves together, how far area and its standard deviation move (median and largest change in percent),
-of how many it changes whether they are credible, doubted or oriented, and how far the volume of voxels moves; ids are
+of how many it changes whether they are credible, doubted or oriented; ids are
 true but for one scene, where they are those of "nview". Of tracking, for each series: how many links come or go, by how
 much short and long change, and how far the probabilities of links move; the series are simulated plants, two plants in
 one pot, and those of `--series`, TABLE RESULTS as `benchmarks/tracking.py results` takes them.
@@ -62,8 +62,6 @@ from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, name_regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs
@@ -332,7 +330,7 @@ def thirds_of_reconstruction(args: argparse.Namespace) -> None:
 
 
 def fit_all(scenes: list[LabelledScene], kind: str) -> np.ndarray:
-    """(N, 6) of all leaves that have two masks: area, its standard deviation, credible, reasons, oriented, volume."""
+    """(N, 5) of all leaves that have two masks: area, its standard deviation, credible, reasons, oriented."""
     rows = []
     for index, scene in enumerate(scenes):
         regions, ids = scene.masks(kind)
@@ -340,27 +338,19 @@ def fit_all(scenes: list[LabelledScene], kind: str) -> np.ndarray:
         if index == len(SHAPES):
             graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)
             ids = match_nview(regions, scene.cameras, graph).instance_ids
-        voxels = reconstruct_instances(regions, ids, scene.cameras)
-        for instance, leaf in fit_surfaces(regions, ids, scene.cameras).items():
-            volume = voxels[instance].without_crumbs().volume if instance in voxels else np.nan
-            rows.append((*describe_leaf(leaf), volume))
+        for leaf in fit_surfaces(regions, ids, scene.cameras).values():
+            about = leaf.is_credible, len(leaf.quality.reasons), leaf.is_oriented
+            rows.append((leaf.area, leaf.deviations[0], *about) if leaf.exists else (np.nan, np.nan, 0, 1, 0))
     return np.array(rows)
-
-
-def describe_leaf(leaf: LeafSurface) -> tuple[float, ...]:
-    if not leaf.exists:
-        return np.nan, np.nan, 0.0, 1.0, 0.0
-    return leaf.area, leaf.deviations[0], leaf.is_credible, len(leaf.quality.reasons), leaf.is_oriented
 
 
 def compare_leaves(before: np.ndarray, after: np.ndarray) -> str:
     if np.array_equal(before, after, equal_nan=True):
         return "nothing"
-    area, sd, volume = (100 * np.abs(np.log(after[:, column] / before[:, column])) for column in (0, 1, 5))
+    area, sd = (100 * np.abs(np.log(after[:, column] / before[:, column])) for column in (0, 1))
     parts = [f"{name} {np.nanmedian(each):.1f} / {np.nanmax(each):.1f}" for name, each in (("area", area), ("sd", sd))]
     turned = zip((before[:, 2:5] != after[:, 2:5]).sum(0), ("credible", "doubted", "oriented"), strict=True)
-    parts += [f"{count} {name}" for count, name in turned if count]
-    return ", ".join([*parts, f"volume {np.nanmax(volume):.1f}"])
+    return ", ".join([*parts, *(f"{count} {name}" for count, name in turned if count)])
 
 
 # --- tracking

@@ -12,12 +12,15 @@ leaves whose base is right, "CPU s" the processor seconds of `fit_surfaces` for 
 `--real FOLDER` is a scene with true label images in `truth/`: every view is left out in turn, the surfaces of the
 others are projected into it, and the mean IoU with the true masks is printed: with all that the surface covers, and
 without the pixels that show other instances or are ignored.
+
+`--areas FOLDER` is a plant on several dates with true label images in `truth/` and the true area of each leaf in
+`areas.csv`: errors of areas, by what they were measured on and by `use`, and the share inside 95 % intervals.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
+import csv
 import sys
 import time
 from functools import partial
@@ -165,13 +168,31 @@ def leave_one_out(folder: Path) -> None:
             seen = surfaces[instance].project(scene.cameras[[view]])[0].numpy()
             mask = labels == instance
             free = mask | (labels == 0)
-            ious = [(part & mask).sum() / max((part | mask).sum(), 1) for part in (seen, seen & free)]
-            records.append((instance, int(mask.sum()), *ious))
-    _, sizes_px, covered, visible = np.array(records).T
-    large = sizes_px >= np.median(sizes_px)
-    for name, ious in (("all that is covered", covered), ("without other instances", visible)):
-        means = f"{ious.mean():.3f}, larger half {ious[large].mean():.3f}"
-        print(f"{folder.name}: leave one view out, IoU {name}: {means}, {len(ious)} masks")
+            records.append([(part & mask).sum() / max((part | mask).sum(), 1) for part in (seen, seen & free)])
+    for name, ious in zip(("all that is covered", "without other instances"), np.array(records).T, strict=True):
+        print(f"{folder.name}: leave one view out, IoU {name}: {ious.mean():.3f}, {len(ious)} masks")
+
+
+def measure_areas(folder: Path) -> None:
+    """Errors of the areas of one plant on several dates, with true ids."""
+    torch.set_num_threads(1)
+    with (folder / "areas.csv").open(encoding="utf-8") as file:
+        true = {(row["date"], int(row["leaf"])): float(row["mesh_mm2"]) for row in csv.DictReader(file)}
+    rows = dict[str, list[tuple[float, bool]]]()
+    for date in sorted({date for date, _ in true}):
+        scene = load_scene(folder / date)
+        regions = regions_from_label_maps(true_maps(folder / date, scene))
+        for leaf, surface in fit_surfaces(regions, regions.labels, scene.cameras).items():
+            error, reasons = surface.area - true[date, leaf], surface.quality.reasons
+            use = "look" if reasons or not surface.is_credible else "yes"
+            form = "occupancy" if surface.occupancy is not None else "whole sheet"
+            errors = 100 * abs(error) / true[date, leaf], abs(error) <= 1.96 * surface.deviations[0]
+            for name in ("all", form, f"use {use}"):
+                rows.setdefault(name, []).append(errors)
+    for name, pairs in rows.items():
+        percent, inside = np.array(pairs).T
+        spread = "{:.1f} / {:.1f} %".format(*np.quantile(percent, (0.5, 0.9)))
+        print(f"{name:12}{len(pairs):4} {spread}, {(percent <= 20).mean():.2f} within 20 %, {inside.mean():.2f} inside")
 
 
 def main() -> None:
@@ -179,26 +200,28 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, help="folder for label maps")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
     parser.add_argument("--seed", type=int, default=0, help="of the plants; another one for plants never looked at")
-    parser.add_argument("--families", nargs="+", choices=EVALUATED_FAMILIES, default=EVALUATED_FAMILIES)
+    parser.add_argument("--families", nargs="+", choices=[*FAMILIES], default=EVALUATED_FAMILIES)
     parser.add_argument("--views", nargs="+", type=int, default=(5, 10, 20))
     parser.add_argument("--masks", nargs="+", choices=(*KINDS, "detected"), default=KINDS)
     parser.add_argument("--plants", type=int, default=1, help="per family")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--json", type=Path, help="write the records here")
     parser.add_argument("--real", type=Path, help="leave-one-view-out IoU on this scene folder, and nothing else")
+    parser.add_argument("--areas", type=Path, help="errors of the areas of this plant, and nothing else")
     args = parser.parse_args()
+    if args.areas:
+        measure_areas(args.areas)
+        return
     if args.real:
         leave_one_out(args.real)
         return
     if args.cache is None:
-        parser.error("expected --cache DIR or --real FOLDER")
-    plants = args.plants * len(EVALUATED_FAMILIES)
-    preset = Preset(plants=((args.split, plants),), leaves=(NUM_LEAVES,), views=tuple(args.views))
+        parser.error("expected --cache DIR, --real FOLDER or --areas FOLDER")
+    families = (*EVALUATED_FAMILIES, *(each for each in args.families if each not in EVALUATED_FAMILIES))
+    plants = ((args.split, args.plants * len(families)),)
+    preset = Preset(plants=plants, leaves=(NUM_LEAVES,), views=tuple(args.views), families=families)
     scenes = [spec for spec in list_specs(preset, args.seed) if spec.family in args.families]
     work = partial(run_scene, cache=args.cache, kinds=args.masks)
     records = [record for found in run_all(work, scenes, num_workers=args.workers) for record in found]
-    if args.json:
-        args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
     print_table(records)
     print_doubts(records)
 

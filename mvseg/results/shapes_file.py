@@ -7,6 +7,7 @@ leaf stand one after another, and an array `num_...` holds these lengths.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError
+from mvseg.reconstruction.numbers import OCCUPANCY
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS
-from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Occupancy, Quality
 from mvseg.reconstruction.voxels import VoxelGrid
 
 SURFACES_FILE, VOXELS_FILE = "surfaces.npz", "voxels.npz"
@@ -28,11 +30,14 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
 
     Arrays of N leaves: `leaf` (N,) int64, their ids; `coefficients` (N, 26, 3) and `covariance` (N, 78, 78) float64,
     `is_oriented` (N,) bool, see `LeafSurface`; `num_views` (N,) int64, and one after another `views` int64,
-    `residual_px` and `iou` float64; `num_reasons` (N,) int64, and one after another `reasons`, text, and their codes.
+    `residual_px` and `iou` float64; of those M leaves that have an `occupancy`: `occupied` (M,) int64, their places,
+    `shares` (M, `OCCUPANCY.cells`) float32 and `area` (M, 2) float64, with its deviation; `num_reasons` (N,) int64, and
+    one after another `reasons`, text, and their codes.
     """
     leaves = sorted(surfaces)
     own = [surfaces[leaf] for leaf in leaves]
     reasons = [each.quality.reasons for each in own]
+    occupied = {place: each.occupancy for place, each in enumerate(own) if each.occupancy is not None}
     np.savez_compressed(
         path,
         leaf=np.array(leaves, np.int64),
@@ -43,6 +48,9 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
         views=np.concatenate([np.zeros(0, np.int64), *(each.views.cpu().numpy() for each in own)]),
         residual_px=np.concatenate([np.zeros(0), *(each.residual_px.cpu().numpy() for each in own)]),
         iou=np.concatenate([np.zeros(0), *(each.iou.cpu().numpy() for each in own)]),
+        occupied=np.array([*occupied], np.int64),
+        shares=_stack((each.shares for each in occupied.values()), OCCUPANCY.cells).astype(np.float32),
+        area=np.array([(each.area, each.sd) for each in occupied.values()], np.float64).reshape(-1, 2),
         num_reasons=np.array([len(each) for each in reasons], np.int64),
         reasons=np.array([text for each in reasons for text in each.values()], np.str_),
         codes=np.array([code for each in reasons for code in each], np.str_),
@@ -63,12 +71,17 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         rows = arrays["leaf"], arrays["is_oriented"], reasons, names, coefficients, covariance, views, residuals, ious
         surfaces = {}
         for leaf, is_oriented, doubts, codes, *own in zip(*rows, strict=True):
-            tensors = {name: torch.from_numpy(each.copy()) for name, each in zip(TENSORS, own, strict=True)}
+            tensors: dict[str, Any] = {name: torch.from_numpy(each.copy()) for name, each in zip(TENSORS, own, strict=True)}
             quality = Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True)))
             surface = LeafSurface(**tensors, is_oriented=bool(is_oriented), quality=quality)
             if not surface.exists and (surface.coefficients.isfinite().any() or not surface.quality.reasons):
                 raise ValueError(f"leaf {leaf} has coefficients that are not finite")
             surfaces[int(leaf)] = surface
+        occupied = (arrays.get(name, ()) for name in ("occupied", "shares", "area"))  # an older version has none
+        for place, shares, (area, sd) in zip(*occupied, strict=True):
+            leaf = int(arrays["leaf"][place])
+            occupancy = Occupancy(torch.from_numpy(shares.reshape(OCCUPANCY.cells).copy()), float(area), float(sd))
+            surfaces[leaf] = replace(surfaces[leaf], occupancy=occupancy)
         return ByInstance(surfaces)
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None

@@ -232,7 +232,8 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
 
 
 def _see_leaf(number: int, shape: LeafSurface | VoxelGrid | None, numbers: Numbers, frame: Floats | None) -> SeenLeaf:
-    vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
+    mesh = shape.mesh(*MESH_SHAPE) if isinstance(shape, LeafSurface) else None if shape is None else shape.mesh()
+    vertices = np.zeros((0, 3)) if mesh is None else np.asarray(mesh.vertices)
     if len(vertices) < OBSERVATIONS.cloud:
         return SeenLeaf(number, None, None, None, False, numbers)
     points = vertices if frame is None else vertices @ frame.T

@@ -74,7 +74,7 @@ def leaves_of(date: PlantOnDate) -> DateLeaves:
         normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
         points=np.array([leaf.points for leaf in shaped]).reshape(-1, OBSERVATIONS.cloud, 3),
         lengths=np.array([leaf.length for leaf in shaped]),
-        areas=np.array([leaf.numbers["area"].value if "area" in leaf.numbers else np.nan for leaf in shaped], float),
+        areas=np.array([leaf.numbers["area"].value if "length" in leaf.numbers else np.nan for leaf in shaped], float),
         base_sd=np.array([sd(leaf, "insertion_height") for leaf in shaped]),
         turn_sd=np.radians(np.array([sd(leaf, "azimuth") for leaf in shaped])),
         is_oriented=np.array([leaf.is_oriented for leaf in shaped], bool),

@@ -93,6 +93,8 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
         values |= {"base_inclination": 90 - values["insertion_angle"], "tip_inclination": 90 - values.pop("tip_angle")}
         sds |= {"base_inclination": sds["insertion_angle"], "tip_inclination": sds.pop("tip_angle")}
     numbers = {name: Measurement(float(value), sds[name], "surface") for name, value in values.items()}
+    if surface.occupancy is not None:
+        numbers["area"] = measure_area(surface)
     if frame is not None and not numbers["azimuth"].sd <= VAGUE_DEG:
         numbers["azimuth"] = STEEP
     if not surface.is_oriented:
@@ -100,6 +102,14 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
     if frame is None:
         numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
     return numbers
+
+
+def measure_area(surface: LeafSurface) -> Measurement:
+    """Area of a leaf whose surface may explain its masks badly: what no mask confirms adds to its deviation."""
+    sd = surface.deviations[0]
+    if surface.occupancy is not None:
+        return Measurement(surface.area, sd, "surface, occupancy")
+    return Measurement(surface.area, max(sd, (1 - float(surface.iou.median())) * surface.area), "surface")
 
 
 def wrap_azimuth(degrees: float) -> float:

@@ -22,7 +22,7 @@ from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Kind, Rejection, find_rejected, median_iou
-from mvseg.traits.leaf import NEED_UP, Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.leaf import NEED_UP, Measurement, measure_area, measure_leaf, measure_voxels, missing
 from mvseg.traits.nodes import Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
@@ -207,6 +207,8 @@ def measure_plant(
         if instance in voxels and instance not in rejected:
             numbers |= measure_voxels(voxels[instance])
         fitted = None if surfaces is None else surfaces.get(instance, NO_MASKS)
+        if fitted is not None and fitted.exists and instance not in blades and instance not in rejected:
+            numbers["area"] = measure_area(fitted)
         leaf = describe_leaf(
             instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
         )

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvseg.arrays import Floats
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, measure_sizes
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, missing
 from mvseg.traits.ontology import PLANT_TRAITS
 
@@ -63,6 +63,10 @@ def _measure_surfaces(
     sds = torch.einsum("tni,nij,tnj->nt", slopes, covariance, slopes).clamp(min=0).sqrt().numpy()
     names = ["total_leaf_area", "convex_hull_volume", *(("height",) if frame is not None else ())]
     values = dict(zip(names, measure(coefficients).tolist(), strict=True))
+    for place, surface in enumerate(surfaces.values()):
+        if surface.occupancy is not None:
+            values["total_leaf_area"] += surface.area - measure_sizes(surface.coefficients.numpy())[0]
+            sds[place, 0] = surface.deviations[0]
     method = "surface" if len(surfaces) == num_leaves else f"surface ({len(surfaces)} of {num_leaves} leaves)"
     for (name, value), sd in zip(values.items(), np.linalg.norm(sds, axis=0).tolist(), strict=True):
         numbers[name] = Measurement(value, sd, method)

@@ -164,10 +164,13 @@ class Rectangle(EllipticBlade):
         return (np.abs(points[..., 0]) <= 1) & (np.abs(points[..., 1]) <= 0.33)
 
 
-@pytest.mark.parametrize(("blade", "reason"), [(Star(), "lobes or holes"), (Rectangle(), "one end is blunt")])
-def test_a_shape_that_is_none_of_a_patch_is_doubted(blade: EllipticBlade, reason: str) -> None:
-    (said,) = fit(blade_masks(blade, CAMERAS)).quality.reasons.values()
-    assert reason in said
+def test_shapes_that_no_patch_has() -> None:
+    """The bays of a star are no part of its area; where a rectangle ends is doubted."""
+    star = fit(blade_masks(Star(), CAMERAS))
+    assert star.quality.is_good
+    assert star.area == pytest.approx(2.2584, rel=0.02)  # the integral of r^2 / 2
+    assert star.mesh().area == pytest.approx(star.area, rel=0.03)
+    assert [*fit(blade_masks(Rectangle(), CAMERAS)).quality.reasons] == ["blunt_end"]
 
 
 def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:

@@ -20,9 +20,10 @@ from mvseg.reconstruction.surface.find_starts import area_cost, find_starts, wid
 from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patches
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality, cell_normals, measure_sizes
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stack_masks
+from mvseg.reconstruction.surface.occupancy import occupy_surface, unshown_share
 from mvseg.reconstruction.surface.orientation import orient_surfaces
 from mvseg.reconstruction.surface.patch_image import (
     crop_ious,
@@ -181,7 +182,7 @@ def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface]:
     return [
         LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
         if fit is None
-        else _surface(masks, fit, offsets=fit.offsets_px, is_judged=False)
+        else _surface(masks, fit, offsets=fit.offsets_px)
         for each, (masks, fit) in zip(asked, _approach(asked, is_rough=True), strict=True)
     ]
 
@@ -256,11 +257,17 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
         masks = replace(each.masks, others=hiding)
         (fit,) = fit_patches(masks, coefficients[None], num_steps=FIT.num_steps, errors=each.errors)
         fit = replace(fit, spread=first.spread)
-        surfaces.append(_surface(masks, fit, offsets=first.offsets_px.numpy(), is_judged=True))
+        surface = _surface(masks, fit, offsets=first.offsets_px.numpy())
+        if surface.exists:
+            points = patch_grid(*FIT.grid).points(fit.coefficients)
+            unshown = unshown_share(masks, points)
+            surface = occupy_surface(surface, each.masks, hidden=masks, unshown=unshown)
+            surface = replace(surface, quality=Quality(_judge(surface, unshown) | _judge_ends(points)))
+        surfaces.append(surface)
     return surfaces
 
 
-def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: bool) -> LeafSurface:
+def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats) -> LeafSurface:
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "shape_unknown", "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)
@@ -280,42 +287,34 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats, is_judged: boo
     if fit.spread:
         wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
         surface = replace(surface, covariance=wider * surface.covariance)
-    if not is_judged:
-        return surface
-    return replace(surface, quality=Quality(_judge(surface) | _judge_shape(masks, points)))
+    return surface
 
 
-def _judge_shape(masks: MaskStack, points: Floats) -> dict[str, str]:
-    """The reasons why a shape may be none that a patch can have; `points` (rows, columns, 3) of its grid."""
-    reasons, areas = dict[str, str](), np.linalg.norm(cell_normals(points), axis=-1).ravel()
-    centres = (points[1:, 1:] + points[1:, :-1] + points[:-1, 1:] + points[:-1, :-1]) / 4
-    px = project_points(masks.px_from_world, centres).px.reshape(-1, 2)
-    stack = np.arange(len(masks)).repeat(len(areas))
-    is_open = (masks.look_up(masks.others, stack, px) == 0).reshape(len(masks), -1)
-    is_inside = masks.look_up(masks.inside, stack, px).reshape(len(masks), -1)
-    shown = (is_inside & is_open).sum(0) / np.maximum(is_open.sum(0), 1)
-    unshown = float(areas[shown < DOUBTS.least_shown].sum() / areas.sum())
-    if unshown > DOUBTS.most_unshown:
-        reasons["lobed"] = f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes"
+def _judge_ends(points: Floats) -> dict[str, str]:
+    """The reason to doubt the length of a patch; `points` (rows, columns, 3) of its grid."""
     along = np.linalg.norm(np.diff(points[:, points.shape[1] // 2], axis=0), axis=-1).cumsum()
     widths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
     places = np.append(0, along) / along[-1]
     ends = np.interp((DOUBTS.near_end, 1 - DOUBTS.near_end), places, widths) / widths.max()
-    if ends.max() > DOUBTS.blunt:
-        reasons["blunt_end"] = "one end is blunt: where the midrib ends, and so the length, is a guess"
-    return reasons
+    if ends.max() <= DOUBTS.blunt:
+        return {}
+    return {"blunt_end": "one end is blunt: where the midrib ends, and so the length, is a guess"}
 
 
-def _judge(surface: LeafSurface) -> dict[str, str]:
+def _judge(surface: LeafSurface, unshown: float) -> dict[str, str]:
     reasons = {}
     if not surface.is_credible:
         reasons["no_blade"] = "no leaf, or its masks contradict each other: no single blade explains them"
     if len(surface.views) == 2:
         reasons["two_views"] = "seen in two views only"
     iou = float(surface.iou.median())
-    if iou < DOUBTS.least_iou:
+    if iou < DOUBTS.least_iou and surface.occupancy is not None:
+        reasons["lobed"] = f"lobes or leaflets beside its sheet (median IoU {iou:.2f}): length and width are guesses"
+    elif iou < DOUBTS.least_iou:
         reasons["poor_fit"] = f"the surface explains its masks badly (median IoU {iou:.2f})"
     share = surface.deviations[0] / surface.area
     if share > DOUBTS.most_area_share:
         reasons["uncertain_area"] = f"its area is uncertain by {100 * share:.0f} %"
+    if unshown > DOUBTS.most_unshown and surface.occupancy is None:
+        reasons["lobed"] = f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes"
     return reasons

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any, TypeVar
 
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.arrays import Floats
 from mvseg.crop import Crop
 from mvseg.findings.finding import list_some
-from mvseg.reconstruction.numbers import DOUBTS, FIT
+from mvseg.reconstruction.numbers import DOUBTS, FIT, OCCUPANCY
 from mvseg.reconstruction.surface.leaf_patch import (
     MIDRIB,
     NUM_COEFFICIENTS,
@@ -43,6 +44,30 @@ class Quality:
         return not self.reasons
 
 
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """Cells of a sheet that its leaf covers.
+
+    Attributes:
+        shares: `OCCUPANCY.cells` float32, probability that a cell of the sheet is leaf; rows from base to tip.
+        area: integral of `shares` over the sheet.
+        sd: standard deviation of `area`.
+    """
+
+    shares: Tensor
+    area: float
+    sd: float
+
+    @property
+    def is_leaf(self) -> NDArray[np.bool_]:
+        """(rows, columns) cells within the outline."""
+        return self.shares.numpy() >= 0.5
+
+    def flip(self, *axes: int) -> Occupancy:
+        """The same with rows (axis 0) or columns (axis 1) in reverse order."""
+        return replace(self, shares=self.shares.flip(axes))
+
+
 class ByInstance(dict[int, T]):
     """{instance id: shape}; a KeyError says which ids there are."""
 
@@ -66,6 +91,7 @@ class LeafSurface:
         quality: good, or the reasons to doubt it.
         offsets_px: (S,) float64, how much too large its masks were for its first fit, in pixels of that: all masks of a
             scene tell how they err. (0,) where that is not known: of a surface that was read from a file.
+        occupancy: where on the surface the leaf is; None: everywhere.
     """
 
     coefficients: Tensor
@@ -76,6 +102,7 @@ class LeafSurface:
     is_oriented: bool
     quality: Quality
     offsets_px: Tensor = field(default_factory=partial(torch.zeros, 0, dtype=torch.float64))
+    occupancy: Occupancy | None = None
     _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -118,8 +145,8 @@ class LeafSurface:
 
     @cached_property
     def area(self) -> float:
-        """One-sided area of the mesh; NaN without a surface."""
-        return measure_sizes(self.coefficients.numpy())[0]
+        """One-sided area of the leaf; NaN without a surface."""
+        return measure_sizes(self.coefficients.numpy())[0] if self.occupancy is None else self.occupancy.area
 
     @cached_property
     def length(self) -> float:
@@ -136,7 +163,7 @@ class LeafSurface:
         """Standard deviations of area, length and width."""
         grid = patch_grid(*MESH_SHAPE)
         area, length, width = self.deviation(lambda leaves: grid_sizes(grid.points(leaves))).tolist()
-        return area, length, width
+        return area if self.occupancy is None else self.occupancy.sd, length, width
 
     def deviation(self, measure: Callable[[Floats], Floats]) -> Floats:
         """Standard deviations of measures of the surface: those of the coefficients, propagated linearly.
@@ -170,13 +197,24 @@ class LeafSurface:
         mean = cell_normals(self.points().numpy()).sum((0, 1))
         return torch.from_numpy(mean / max(float(np.linalg.norm(mean)), 1e-300))
 
-    def mesh(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> trimesh.Trimesh:
+    def mesh(self, num_rows: int = 0, num_columns: int = 0) -> trimesh.Trimesh:
         """Open mesh of `points`, whose first vertex is the base and whose last one is the tip; empty without a surface.
-        Its normals point to the side that most cameras of the fit saw."""
+        Faces are left out where the leaf is not; 0: as many vertices as that takes. Normals point to the side that most
+        cameras of the fit saw."""
         if not self.exists:
             return trimesh.Trimesh()
+        if not num_rows:
+            rows, columns = OCCUPANCY.cells
+            num_rows, num_columns = MESH_SHAPE if self.occupancy is None else (rows + 1, columns + 1)
         vertices = grid_vertices(self.points(num_rows, num_columns).numpy())
-        return trimesh.Trimesh(vertices, grid_triangles(num_rows, num_columns), process=False)
+        faces = grid_triangles(num_rows, num_columns)
+        if self.occupancy is not None:
+            places = np.meshgrid(np.linspace(0, 1, num_rows), np.linspace(0, 1, num_columns), indexing="ij")
+            corners = grid_vertices(np.stack(places, -1))[faces]
+            corners[..., 1][np.isin(faces, (0, len(vertices) - 1))] = np.nan  # the ends have no place across
+            row, column = (np.nanmean(corners, axis=1) * OCCUPANCY.cells).astype(int).T
+            faces = faces[self.occupancy.is_leaf[row, column]]
+        return trimesh.Trimesh(vertices, faces, process=False)
 
     def project(self, cameras: Cameras) -> list[Tensor]:
         """V masks (H, W) bool on the cameras' device: the pixels that the surface covers half or more of, as if nothing
@@ -201,12 +239,13 @@ class LeafSurface:
         nothing = Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))
         if not self.exists:
             return [nothing] * len(sizes)
-        points = self.points()
+        has_holes = self.occupancy is not None
+        points = self.points(*(count + 1 for count in OCCUPANCY.cells)) if has_holes else self.points()
         px, depth = cameras.project(points.reshape(-1, 3))
-        parts = []
+        parts, is_leaf = [], True if self.occupancy is None else self.occupancy.is_leaf.ravel()
         for view, size in enumerate(sizes):
-            is_ahead = (grid_quads(depth[view].reshape(*MESH_SHAPE, 1).numpy()) > 0).all((1, 2))
-            quads = grid_quads(px[view].reshape(*MESH_SHAPE, 2).numpy())[is_ahead]
+            is_ahead = (grid_quads(depth[view].reshape(*points.shape[:2], 1).numpy()) > 0).all((1, 2))
+            quads = grid_quads(px[view].reshape(*points.shape[:2], 2).numpy())[is_ahead & is_leaf]
             if not len(quads):
                 parts.append(nothing)
                 continue

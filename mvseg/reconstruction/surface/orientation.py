@@ -45,10 +45,10 @@ def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[
     for (instance, surface), (first, last) in zip(there.items(), distances, strict=True):
         is_clear = has_stem and abs(first - last) > STEM.clear * surface.length
         if last < first:
-            surface = _transform(surface, reversal_matrix())
+            surface = _transform(surface, reversal_matrix(), 0, 1)
         surface = replace(surface, is_oriented=bool(is_clear))
         towards = cameras.centers[surface.views].mean(0).cpu() - surface.midrib.mean(0)
-        oriented[instance] = _transform(surface, mirror_matrix()) if towards @ surface.normal < 0 else surface
+        oriented[instance] = _transform(surface, mirror_matrix(), 1) if towards @ surface.normal < 0 else surface
     return oriented
 
 
@@ -80,10 +80,11 @@ def base_distances(ends: Floats) -> Floats:
     return to_bases.sum(2)
 
 
-def _transform(surface: LeafSurface, matrix: Floats) -> LeafSurface:
+def _transform(surface: LeafSurface, matrix: Floats, *axes: int) -> LeafSurface:
     full = torch.from_numpy(np.kron(matrix, np.eye(3)))
     return replace(
         surface,
         coefficients=torch.from_numpy(matrix) @ surface.coefficients,
         covariance=full @ surface.covariance @ full.T,
+        occupancy=None if surface.occupancy is None else surface.occupancy.flip(*axes),
     )
