@@ -47,9 +47,10 @@ def test_a_folder_of_photos_becomes_a_scene(photos: Path, tmp_path: Path, capsys
     said = capsys.readouterr()
     assert f"{out}: 7 of 7 photos registered, 0." in said.out
     assert "scale from 7 positions of log.csv, residual 0." in said.out
+    assert "of 360 degrees round the plant; none from the" in said.out.split("mvseg: look at: ")[0]
     assert all(step in said.err for step in ("photos:", "features:", "matching:", "mapping:"))  # no silent minute
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log.csv", "scene"]
-    assert sorted(path.name for path in out.iterdir()) == ["cameras.json", "images", "pose.json", "sparse"]
+    assert sorted(path.name for path in out.iterdir()) == ["cameras.json", "images", "pose.json", "sparse", "walk.svg"]
 
     scene, truth = load_scene(out), room_cameras()
     check_photos(scene)

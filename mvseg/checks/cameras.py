@@ -64,8 +64,7 @@ def camera_findings(scene: Scene, coverage: Coverage) -> list[Finding]:
     cameras, names = scene.cameras, tuple(view.name for view in scene.views)
     rules = [*_place_rules(cameras, coverage), *_lens_rules(cameras)]
     world = {"unknown_unit": not scene.unit, "unknown_up": scene.up is None, "upside_down": scene.seems_upside_down}
-    for code in (code for code, is_so in world.items() if is_so):
-        rules.append((code, "warning" if code == "upside_down" else "note", None, {}))
+    rules += [(code, "warning" if code == "upside_down" else "note", None, {}) for code in world if world[code]]
     return list_findings(rules, names)
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.numbers import IMAGES
-from mvseg.findings.finding import Finding, Rule, list_findings
+from mvseg.findings.finding import Finding, Rule, Values, list_findings
 from mvseg.formats.masks.view_regions import mask_faults
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -37,16 +37,14 @@ def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
 
 
 def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
-    rules: list[Rule] = []
-    areas, total = regions.areas.numpy(), len(regions)
-    tiny = areas < IMAGES.tiny_px
-    if tiny.mean() > IMAGES.many:
-        values = {"px": IMAGES.tiny_px, "median": float(np.median(areas))}
-        rules.append(("tiny_masks", "warning", None, {"count": int(tiny.sum()), "total": total, **values}))
-    cut = touches_border(regions, cameras)
-    if float(cut.float().mean()) > IMAGES.many:
-        rules.append(("cut_masks", "warning", None, {"count": int(cut.sum()), "total": total}))
-    return rules
+    areas = regions.areas.numpy()
+    size: Values = {"px": IMAGES.tiny_px, "median": float(np.median(areas))}
+    is_tiny, is_cut = areas < IMAGES.tiny_px, touches_border(regions, cameras).numpy()
+    return [
+        (code, "warning", None, {"count": int(is_faulty.sum()), "total": len(areas), **more})
+        for code, is_faulty, more in (("tiny_masks", is_tiny, size), ("cut_masks", is_cut, {}))
+        if is_faulty.mean() > IMAGES.many
+    ]
 
 
 def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:

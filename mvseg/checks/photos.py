@@ -80,19 +80,16 @@ def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
 def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     whole = [view for view, each in enumerate(facts) if each.size is not None]
     blank = [view for view in whole if facts[view].is_blank]
-    shown = [view for view in whole if view not in blank]
-    dark = [view for view in shown if facts[view].content.level < IMAGES.dark]
-    burnt = [view for view in shown if facts[view].content.burnt > IMAGES.burnt]
-    grey = [view for view in shown if facts[view].content.grey]
+    contents = {view: facts[view].content for view in whole if view not in blank}
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
         same[facts[view].digest].append(view)
     twins = [views for views in same.values() if len(views) > 1]
     return [
         ("blank_photo", "error", blank, {}),
-        ("dark_photo", "warning", dark, {}),
-        ("overexposed_photo", "warning", burnt, {}),
-        ("grey_photo", "note", grey, {}),
+        ("dark_photo", "warning", [view for view, each in contents.items() if each.level < IMAGES.dark], {}),
+        ("overexposed_photo", "warning", [view for view, each in contents.items() if each.burnt > IMAGES.burnt], {}),
+        ("grey_photo", "note", [view for view, each in contents.items() if each.grey], {}),
         *(("same_photo", "error", views, {}) for views in twins),
     ]
 

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from mvseg.checks.check_scene import Check
 
 WRONG = 1  # definition: exit code
-CHECK_FILE, PLAN_FILE, TARGET_FILE = "check.json", "cameras.png", "target.json"
+CHECK_FILE, TARGET_FILE = "check.json", "target.json"
 
 
 def add_options(parser: ArgumentParser) -> None:
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md), or a result of mvseg infer"
     parser.add_argument("scene", type=Path, help=help_scene)
-    help_out = "folder for check.json (target.json), and for cameras.png, a plan (default: nothing is written)"
+    help_out = "folder for check.json (target.json), and for walk.svg, a plan (default: nothing is written)"
     parser.add_argument("--out", type=Path | None, help=help_out)
     add_shared(parser, "masks", "categories", "coco_crowd", "quiet")
     help_target = "the photos show the page of mvseg target: how right are the areas of its shapes?"
@@ -40,12 +40,13 @@ def run(args: Namespace) -> int:
         return _run_target(args)
     if args.bar is not None:
         raise InputError("--bar is of the page of mvseg target, expected --target with it")
+    from mvseg.checks.camera_plan import WALK_FILE
     from mvseg.results.earlier import RUN_FILE, check_file
 
     if args.out is not None:
         check_file(args.out / CHECK_FILE, b'"findings"')
         if not (args.out / CHECK_FILE).exists():  # an earlier check wrote both
-            check_file(args.out / PLAN_FILE, None)
+            check_file(args.out / WALK_FILE, None)
     if (args.scene / RUN_FILE).is_file():
         if args.masks is not None:
             raise InputError(f"--masks has no effect: {args.scene} is a result, which has its masks")
@@ -177,14 +178,12 @@ def _or_none(value: float) -> float | None:
 
 
 def _write(out: Path, check: Check, findings: Sequence[Finding]) -> None:
-    from mvseg.checks.camera_plan import draw_cameras
-    from mvseg.formats.image_file import write_png
-    from mvseg.system.atomic import write_text_whole, write_whole
+    from mvseg.checks.camera_plan import WALK_FILE, draw_walk
+    from mvseg.system.atomic import write_text_whole
 
     off = {view for each in findings if each.topic == "poses" and each.level == "error" for view in each.views}
     content = {"scene": check.scene.name, "findings": [each.as_json() for each in findings], "views": _rows(check)}
     out.mkdir(parents=True, exist_ok=True)
     write_text_whole(out / CHECK_FILE, json.dumps(content, indent=1) + "\n")
-    picture = draw_cameras(check.scene, check.coverage, tuple(sorted(off)))
-    write_whole(out / PLAN_FILE, lambda partial: write_png(partial, picture))
-    say(f"{out}: {CHECK_FILE}, {PLAN_FILE}", to_stderr=True)
+    write_text_whole(out / WALK_FILE, draw_walk(check.scene, tuple(off))[1])
+    say(f"{out}: {CHECK_FILE}, {WALK_FILE}", to_stderr=True)

@@ -66,8 +66,7 @@ def calibrate_turntable(
     for name, each in photos.items():
         where = f"camera {name}: " if len(photos) > 1 else ""
         if len(each) != num_angles:
-            first = next(iter(photos))
-            message = f"{len(each)} photos, {num_angles} of camera {first}"
+            message = f"{len(each)} photos, {num_angles} of camera {next(iter(photos))}"
             raise InputError(f"{where}{message}, expected as many, at the same angles in the same order")
         boards[name] = _find_boards(each, board, where)
     is_given = lens is not None
@@ -163,10 +162,8 @@ def _initialise(
             turned = placed[name].inverse() * pose * world_from_board.inverse()
             angles.setdefault(place, float(np.degrees(_rotation(turned).as_rotvec()[2])))
     zero = angles[min(angles)]
-    cameras = {}
-    for name, lens in lenses.items():
-        at_zero = placed[name] * _turn_z(zero)
-        cameras[name] = replace(lens, R=at_zero.rotation.matrix(), t=at_zero.translation)
+    poses_of = [(name, lens, placed[name] * _turn_z(zero)) for name, lens in lenses.items()]
+    cameras = {name: replace(lens, R=pose.rotation.matrix(), t=pose.translation) for name, lens, pose in poses_of}
     return cameras, {place: angle - zero for place, angle in angles.items()}, world_from_board
 
 

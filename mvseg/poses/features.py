@@ -63,10 +63,9 @@ def find_features(database: Path, folder: Path, names: Sequence[str], *, image_s
         number_of = {image.name: image.image_id for image in opened.read_all_images()}
         for name in progress_bar(names, name="features", unit="photo"):
             sift = find_sift(read_rgb(folder / name), image_size=size, most=STRUCTURE.quick_most)
-            number = number_of[name]
-            opened.write_keypoints(number, np.column_stack([sift.px, sift.scale, sift.angle]))
+            opened.write_keypoints(number_of[name], np.column_stack([sift.px, sift.scale, sift.angle]))
             bytes_of = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sift.descriptors)
-            opened.write_descriptors(number, bytes_of)
+            opened.write_descriptors(number_of[name], bytes_of)
             coarse.append(coarsest(sift))
     return count_alike(coarse)
 

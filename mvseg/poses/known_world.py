@@ -186,13 +186,9 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     share = alignment.rms / spreads(target)[0]
     if share > WORLD.misfit:
         warn(Finding("positions_misfit", str(path), {"share": float(share)}))
-    return Placement(
-        similarity=alignment.similarity,
-        unit=unit,
-        source=f"{int(alignment.is_inlier.sum())} positions of {path.name}",
-        residual=alignment.rms,
-        left_out=tuple(names[row] for row in rows[~alignment.is_inlier]),
-    )
+    wrong = tuple(names[row] for row in rows[~alignment.is_inlier])
+    source, similarity = f"{int(alignment.is_inlier.sum())} positions of {path.name}", alignment.similarity
+    return Placement(similarity=similarity, unit=unit, source=source, residual=alignment.rms, left_out=wrong)
 
 
 def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit: str) -> Placement:

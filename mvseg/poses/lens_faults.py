@@ -69,19 +69,14 @@ def find_lens_fault(model: pycolmap.Reconstruction) -> LensReport:
         return LensReport(Finding("zooms", values=values), model, is_square_known)
     is_squashed = abs(math.log(aspect)) > LENS.squashed and is_square_known and two.noise < LENS.noise_of_squashed
     least_of_own = min(LENS.noise_of_cut_each, LENS.gain_of_own * others)  # it has by far the most freedom
-    likely = [
-        (each.noise, finding, lens)
-        for each, finding, lens, is_so in (
-            (two, Finding("squashed", values={"aspect": aspect}), two.model, is_squashed),
-            (middle, Finding("photos_cut"), model, middle.noise < LENS.noise_of_cut),
-            (own_middle, Finding("photos_cut_each"), model, own_middle.noise < least_of_own),
-            (fisheye, Finding("wide_lens"), model, fisheye.noise < LENS.noise_of_fisheye),
-        )
-        if is_so
-    ]
-    if not likely:
-        return LensReport(None, model, is_square_known)
-    _, finding, best = min(likely, key=lambda each: each[0])
+    causes = (
+        (two.noise, Finding("squashed", values={"aspect": aspect}), two.model, is_squashed),
+        (middle.noise, Finding("photos_cut"), model, middle.noise < LENS.noise_of_cut),
+        (own_middle.noise, Finding("photos_cut_each"), model, own_middle.noise < least_of_own),
+        (fisheye.noise, Finding("wide_lens"), model, fisheye.noise < LENS.noise_of_fisheye),
+        (math.inf, None, model, True),
+    )
+    _, finding, best, _ = min((cause for cause in causes if cause[3]), key=lambda cause: cause[0])
     return LensReport(finding, best, is_square_known)
 
 

@@ -40,14 +40,12 @@ class Structure:
     Attributes:
         model: COLMAP's reconstruction of the registered photos; images have the names of the photos.
         registered: names of the photos with a pose, in the order of all photos; `left_out` are the others.
-        plain: names of the photos with so few features that nothing could register them.
         other_models: number of further photos in each of the other models, which have frames of their own.
     """
 
     model: pycolmap.Reconstruction
     registered: tuple[str, ...]
     left_out: tuple[str, ...]
-    plain: tuple[str, ...]
     other_models: tuple[int, ...]
 
     @property
@@ -85,22 +83,20 @@ def find_structure(
         models, pairs, plain = _map_quickly(task)
         if not models or models[0].num_reg_images() < STRUCTURE.enough * len(photos):
             models = _sorted([*models, *_map_thoroughly(task, pairs)])
-        photo_of = task.photo_of
     found = models[0].num_reg_images() if models else 0
     least = config.min_registered or max(STRUCTURE.least, round(STRUCTURE.least_share * len(photos)))
     if found < min(least, len(photos)):
         raise InputError(_too_few(found, len(photos), least, plain=plain, given=config.min_registered is not None))
     model = models[0]
     for image in list(model.images.values()):
-        image.name = photo_of[image.name].name
+        image.name = task.photo_of[image.name].name
     registered = {image.name for image in model.images.values() if image.has_pose}
     numbers = [set(each.reg_image_ids()) for each in models]
     counts = [len(each.difference(*numbers[:place])) for place, each in enumerate(numbers)]  # in none before it
-    taken, left_out = (
-        tuple(photo.name for photo in photos if (photo.name in registered) == is_taken) for is_taken in (True, False)
-    )
+    taken = tuple(photo.name for photo in photos if photo.name in registered)
+    left_out = tuple(photo.name for photo in photos if photo.name not in registered)
     others = tuple(count for count in counts[1:] if count)
-    return Structure(model=model, registered=taken, left_out=left_out, plain=plain, other_models=others)
+    return Structure(model=model, registered=taken, left_out=left_out, other_models=others)
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,9 +64,6 @@ def _most_alike(alike: NDArray[np.int64], chosen: set[Pair]) -> set[Pair]:
     rest = alike.copy()
     for i, j in chosen:
         rest[i, j] = rest[j, i] = 0
-    pairs = set()
-    for i, row in enumerate(rest):
-        for j in np.argsort(-row, kind="stable")[: STRUCTURE.most_alike]:
-            if row[j] >= STRUCTURE.least_alike and i != j:
-                pairs.add((min(i, int(j)), max(i, int(j))))
-    return pairs
+    most = np.argsort(-rest, axis=1, kind="stable")[:, : STRUCTURE.most_alike].tolist()
+    likely = [(i, j) for i, row in enumerate(most) for j in row if rest[i, j] >= STRUCTURE.least_alike and i != j]
+    return {(min(pair), max(pair)) for pair in likely}

@@ -7,7 +7,7 @@ the picture says how far the camera has come. Where it stands still, frames woul
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -37,18 +37,13 @@ class Footage:
         frames: (F,) int64, numbers of the frames in the video, from 0.
         motion: (F,) how far the picture has moved since the first frame, in longer sides of it; it never falls.
         sharpness: (F,) variance of the Laplacian.
-        stated: number of frames that the file states; 0 where it states none.
+        share: part of the file's seconds that could be read.
     """
 
     frames: NDArray[np.int64]
     motion: Floats
     sharpness: Floats
-    stated: int = 0
-
-    @property
-    def ends_early(self) -> bool:
-        """Whether far fewer frames can be read than the file states."""
-        return int(self.frames[-1]) + int(np.diff(self.frames).max(initial=1)) < VIDEO.whole * self.stated
+    share: float = 1.0
 
 
 def is_video(path: Path) -> bool:
@@ -62,7 +57,7 @@ def write_frames(clip: Path, folder: Path, numbers: Sequence[int]) -> list[str]:
     folder.mkdir(parents=True)
     names = []
     with _opened(clip) as video:
-        for number, frame in _read(video, sorted(numbers)):
+        for number, frame in _read(video, {*numbers}.__contains__):
             names.append(frame_name(number))
             if not cv2.imwrite(str(folder / names[-1]), frame, [cv2.IMWRITE_JPEG_QUALITY, STRUCTURE.quality]):
                 raise OSError(f"{folder / names[-1]} cannot be written")
@@ -78,35 +73,42 @@ def watch(clip: Path) -> Footage:
     """Measure motion and sharpness over a video, in `VIDEO.per_second` frames of each second. Warns (InputWarning) of a
     video that ends early: it is cut short or damaged, or the first of its streams is shorter. Raises InputError if the
     video cannot be opened, or has no frames."""
-    rows: list[tuple[int, float, float]] = []
+    rows: list[tuple[int, float, float, float]] = []
     with _opened(clip) as video, progress_bar(name="video", unit="frame") as bar:
         rate = video.get(cv2.CAP_PROP_FPS)
         every = max(1, round(rate / VIDEO.per_second)) if 0 < rate < 1000 else 1
-        total = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+        # the bit rate, rounded down, is the file's: of the seconds of its longest stream; counts of frames may lie
+        kilobits = video.get(cv2.CAP_PROP_BITRATE)
+        seconds = clip.stat().st_size * 8e-3 / (kilobits + 1) if kilobits > 0 else 0.0
+        if clip.suffix.lower() == ".avi" and rate > 0:  # the index is at the end; nothing is hidden by trimming
+            seconds = max(seconds, video.get(cv2.CAP_PROP_FRAME_COUNT) / rate)
         track, base = None, 0.0
-        for number, frame in _read(video, every=every):
+        for number, frame in _read(video, lambda number: number % every == 0):
             grey = _shrink(frame)
             track, moved, gone = _follow(track, grey)
             motion = max(base + moved, rows[-1][1] if rows else 0.0)
-            rows.append((number, motion, float(cv2.Laplacian(grey, cv2.CV_64F).var())))
+            time = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            rows.append((number, motion, float(cv2.Laplacian(grey, cv2.CV_64F).var()), time))
             base += gone
             bar.update(1)
     if not rows:
         raise InputError(f"{clip}: no frame of the video can be read, expected MP4, MOV, 3GP, AVI, MKV or WebM")
-    frames, moves, sharpness = map(np.array, zip(*rows, strict=True))
-    footage = Footage(frames=frames, motion=moves, sharpness=sharpness, stated=max(total, 0))
-    if footage.ends_early:
-        warn(Finding("film_ends_early", clip.name, {"count": rows[-1][0] + 1, "total": total}))
-    return footage
+    frames, moves, sharpness, times = map(np.array, zip(*rows, strict=True))
+    share = float(times[-1] + np.diff(times).max(initial=1 / max(rate, 1))) / seconds if seconds else 1.0
+    if share < VIDEO.whole:
+        warn(Finding("film_ends_early", clip.name, {"share": share}))
+    return Footage(frames=frames, motion=moves, sharpness=sharpness, share=share)
 
 
 def check_motion(clip: Path, footage: Footage, chosen: Sequence[int]) -> None:
     """Raises InputError: the frames that were chosen are too few, as the picture moves too little."""
+    if not footage.sharpness.any():  # as OpenCV 5.0 reads interlaced films
+        raise InputError(f"{clip}: frames show one colour, expected a film that is not interlaced (ffmpeg -vf bwdif)")
     if len(chosen) < STRUCTURE.least:
         moved, wanted = footage.motion[-1], STRUCTURE.least * VIDEO.step
         message = f"the picture moves by {moved:.0%} of its longer side in {len(footage.frames)} frames"
-        if footage.ends_early:
-            message += f", all that can be read of the {footage.stated} that the file states: copy or convert it again"
+        if footage.share < VIDEO.whole:
+            message += f" ({footage.share:.0%} of the film; no more can be read)"
         raise InputError(f"{clip}: {message}, expected {wanted:.0%} or more: a walk round the plant")
 
 
@@ -197,11 +199,8 @@ def _opened(clip: Path) -> Iterator[cv2.VideoCapture]:
         video.release()
 
 
-def _read(
-    video: cv2.VideoCapture, numbers: Sequence[int] | None = None, *, every: int = 1
-) -> Iterator[tuple[int, NDArray[np.uint8]]]:
-    """Numbers and frames (H, W, 3) BGR, in square pixels: given ones, or one of `every`; smeared ones are left out."""
-    wanted = None if numbers is None else set(numbers)
+def _read(video: cv2.VideoCapture, is_wanted: Callable[[int], bool]) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+    """Numbers and frames (H, W, 3) BGR, in square pixels, of wanted numbers; smeared ones are left out."""
     number = num_failed = 0
     is_smeared = False
     while num_failed < VIDEO.damaged:
@@ -210,7 +209,7 @@ def _read(
             continue
         num_failed = 0
         is_smeared = is_smeared and int(video.get(cv2.CAP_PROP_FRAME_TYPE)) != ord("I")
-        if not is_smeared and (number % every == 0 if wanted is None else number in wanted):
+        if not is_smeared and is_wanted(number):
             is_read, frame = video.retrieve()
             if is_read:
                 yield number, square_pixels(np.asarray(frame, np.uint8), *_aspect(video))

@@ -71,7 +71,7 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         rows = arrays["leaf"], arrays["is_oriented"], reasons, names, coefficients, covariance, views, residuals, ious
         surfaces = {}
         for leaf, is_oriented, doubts, codes, *own in zip(*rows, strict=True):
-            tensors: dict[str, Any] = {name: torch.from_numpy(each.copy()) for name, each in zip(TENSORS, own, strict=True)}
+            tensors: dict[str, Any] = dict(zip(TENSORS, (torch.from_numpy(each.copy()) for each in own), strict=True))
             quality = Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True)))
             surface = LeafSurface(**tensors, is_oriented=bool(is_oriented), quality=quality)
             if not surface.exists and (surface.coefficients.isfinite().any() or not surface.quality.reasons):

@@ -12,6 +12,7 @@ from typing import Any
 import pycolmap
 
 from mvseg._version import made_by
+from mvseg.checks.camera_plan import WALK_FILE, draw_walk
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import Finding, list_some
 from mvseg.formats.opencv_yaml import Calibration, read_calibration
@@ -48,7 +49,7 @@ def pose_photos(
     Args:
         photos: folder of photos, with one folder per camera below it or none; or a video, of which sharp frames become
             the photos.
-        out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
+        out: the scene folder: images/ (upright copies), cameras.json, sparse/0, walk.svg and pose.json.
         up: the direction of up in the known world, or how to find it.
 
     Raises InputError: a photo or the video is broken, the video shows too little motion, too few photos register, world
@@ -81,6 +82,7 @@ def pose_photos(
             scene = move_structure(structure, placement.similarity, folder)
             scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
             write_cameras(scene, folder)
+        walk = write_walk(scene, folder, out)
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
         run |= {
             "config": {"photos": str(photos), **asdict(config), "known": asdict(world), "up": up},
@@ -96,8 +98,16 @@ def pose_photos(
         say(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
         if not report.is_square_known:
             say("  pixels are taken as square: photos from one height do not show it")
+        say(walk)
         say(f"next: mvseg infer {out}")
     return scene
+
+
+def write_walk(scene: Scene, folder: Path, out: Path) -> str:
+    """Write the cameras from above into a folder that becomes `out`; returns the lines that tell of it."""
+    sentence, picture = draw_walk(scene)
+    (folder / WALK_FILE).write_text(picture, encoding="utf-8")
+    return f"  {sentence}\nmvseg: look at: {out / WALK_FILE}"
 
 
 def _lens_findings(report: LensReport, photos: Sequence[PhotoFile]) -> list[Finding]:

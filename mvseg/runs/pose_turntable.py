@@ -25,7 +25,7 @@ from mvseg.poses.mapping import IMAGES
 from mvseg.poses.photo_files import PhotoFile, calibrated_size, copy_photos
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import Output, replace_result
-from mvseg.runs.pose_photos import check_place, list_folder
+from mvseg.runs.pose_photos import check_place, list_folder, write_walk
 from mvseg.scene import Scene
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.say import say
@@ -79,6 +79,7 @@ def pose_board_photos(
         cameras = {name: _describe_camera(fit.cameras[name]) for name in by_camera}
         write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
+        walk = write_walk(scene, folder, out)
         run |= {"residual_px": round(fit.residual_px, 4), "corners": fit.num_corners, "photos": len(files)}
         lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in fit.cameras.items()}
         run["lenses"] = [{"camera": name, "focal_length": asdict(length)} for name, length in lengths.items()]
@@ -93,6 +94,7 @@ def pose_board_photos(
         say(f"{out}: {share}, {fit.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
         for name, length in lengths.items():
             say(f"  {name}: {length.describe()}")
+        say(walk)
         say(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
     return scene
 
@@ -121,14 +123,13 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
             if size != expected:
                 given = f"{size[0]} x {size[1]} pixels, the turntable's camera {expected[0]} x {expected[1]}"
                 raise InputError(f"{file.name} has {given}, expected photos of that camera")
-        places = [f"{IMAGES}/{file.name}" for file in files]
-        views = list(zip(places, camera_of, angle_of, strict=True))
+        views = list(zip([f"{IMAGES}/{file.name}" for file in files], camera_of, angle_of, strict=True))
         write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
+        walk = write_walk(scene, folder, out)
     if now_running().progress:
-        has_step = isinstance(angles, float)
-        described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
-        say(f"{out}: {len(files)} photos at {described}")
+        step = f"steps of {angles:g} degrees" if isinstance(angles, float) else f"the angles of {angles or turntable}"
+        say(f"{out}: {len(files)} photos at {step}\n{walk}")
     return replace(scene, source=out / TURNTABLE_FILE)
 
 
@@ -174,6 +175,5 @@ def _given_lens(given: Calibration, files: Sequence[PhotoFile]) -> TableCamera:
 
 
 def _describe_camera(camera: TableCamera) -> dict[str, Any]:
-    arrays = {"K": camera.K, "R": camera.R, "t": camera.t, "distortion": camera.distortion}
-    described: dict[str, Any] = {"width": camera.size[0], "height": camera.size[1]}
-    return described | {name: each.tolist() for name, each in arrays.items()}
+    arrays = {name: getattr(camera, name).tolist() for name in ("K", "R", "t", "distortion")}
+    return {"width": camera.size[0], "height": camera.size[1], **arrays}

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -11,10 +13,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvseg.checks.camera_plan import FAULT, INK, POINT, draw_cameras
+from mvseg.checks.camera_plan import RED, draw_walk
 from mvseg.checks.cameras import FLIP, camera_findings, field_of_view, find_coverage
 from mvseg.findings.finding import Finding
-from mvseg.scene import Cameras, Scene
+from mvseg.scene import Cameras, Scene, View
 from synthetic import arc_positions, cameras_at, moved
 
 Fault = Callable[[Cameras], Cameras]
@@ -202,13 +204,20 @@ def test_what_is_not_known_is_a_note(demo_scene: Scene) -> None:
     assert [(each.level, each.code) for each in found] == [("note", "unknown_unit"), ("note", "unknown_up")]
 
 
-def test_the_plan_shows_every_camera(demo_scene: Scene) -> None:
-    def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:
-        return cv2.connectedComponents((picture == color).all(2).astype(np.uint8))[0] - 1
-
-    picture = draw_cameras(demo_scene, find_coverage(demo_scene.cameras))
-    assert (count(picture, POINT), count(picture, FAULT)) == (1, 0)
-    assert count(picture, INK) >= 9
-    cameras = turned(demo_scene.cameras, 3, 70)
-    faulty = draw_cameras(replace(demo_scene, cameras=cameras, up=None), find_coverage(cameras), off=(5,))
-    assert count(faulty, FAULT) >= 2
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), None])
+@pytest.mark.parametrize(("span", "num", "degrees", "gaps"), [(30, 3, 30, 1), (160, 9, 160, 1), (320, 9, 360, 0)])
+def test_the_walk_is_measured_in_any_world(
+    up: tuple[float, ...] | None, span: float, num: int, degrees: float, gaps: int
+) -> None:
+    """Without up, cameras at two heights are turned a little."""
+    turn, shift = rotation([1, 2, 3], 70), torch.tensor([5.0, -3.0, 100.0]).double()
+    here = cameras_at(arc_positions(num, span=span))
+    for cameras, to in ((here, torch.eye(3).double()), (moved(here, 0.013, turn, shift), turn)):
+        views = tuple(View(f"<{view}>", Path()) for view in range(num))
+        scene = Scene("walk", views, cameras, up=up and tuple((to @ torch.tensor(up).double()).tolist()))
+        sentence, picture = draw_walk(scene, off=(1,))
+        assert int(sentence.split()[2]) == pytest.approx(degrees, abs=2 if up else 20)
+        assert gaps == sentence.count(f"degrees between <{num - 1}> and <0>")
+        parts = ElementTree.fromstring(picture)
+        assert [part.get("fill") == RED for part in parts.findall("{*}g")] == [view == 1 for view in range(num)]
+        assert sum(part.get("stroke") == RED for part in parts.findall("{*}circle")) == gaps

@@ -99,11 +99,11 @@ def test_single_files_of_the_user_stay(
     arguments: str, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("page.pdf", "cameras.png", "target.json"):
+    for name in ("page.pdf", "walk.svg", "target.json"):
         Path(name).write_text("mine")
     assert main(arguments.split()) == 2
     assert "was not written by mvseg, expected another name, or to move it away" in capsys.readouterr().err
-    assert {Path(name).read_text() for name in ("page.pdf", "cameras.png", "target.json")} == {"mine"}
+    assert {Path(name).read_text() for name in ("page.pdf", "walk.svg", "target.json")} == {"mine"}
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="a folder that looks writable and is not, of Linux")

@@ -14,6 +14,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from mvseg.checks.camera_plan import draw_walk
 from mvseg.results.report.correct import describe_correct, describe_questions
 from mvseg.results.report.leaves import describe_leaves, describe_stems, describe_traits, draw_lines
 from mvseg.results.report.pictures import Picture
@@ -67,6 +68,7 @@ def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[s
         **describe_traits(result.traits),
         "space": describe_space(result),
         "correct": describe_correct(result, pictures, run=run),
+        "walk": draw_walk(scene)[1] if len(scene.views) > 1 else "",
         "run": {name: value for name, value in run.items() if name in RUN_FIELDS}
         | {"config": json.dumps(run.get("config", {}), indent=1, default=str)},
     }

@@ -49,6 +49,8 @@ function buildRun(data) {
   const terms = facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]);
   document.getElementById("run").append(
     element("div", { id: "findings" }, element("h2", {}, "Findings"), list),
+    ...(data.walk ? [element("details", {}, element("summary", {}, "Cameras from above"),
+      element("img", { src: `data:image/svg+xml,${encodeURIComponent(data.walk)}`, alt: "cameras round the plant", width: 360 }))] : []),
     element("details", {}, element("summary", {}, "Run"), element("dl", {}, ...terms)),
     element("details", {}, element("summary", {}, "Options"), element("pre", {}, run.config)),
   );
