@@ -23,13 +23,13 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.choice import true_maps
 from benchmarks.confidence import has_right_id
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps, visible_ids
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
-from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
@@ -59,13 +59,9 @@ def read_given(folder: Path) -> Given:
     """The `masks/` of a real plant."""
     scene = load_scene(folder)
     regions = load_masks(scene, folder / "masks")
-    sizes = scene.cameras.sizes.tolist()
-    maps = [
-        read_label_png(folder / "truth" / f"{view.name}.png", *size)
-        for view, size in zip(scene.views, sizes, strict=True)
-    ]
+    leaf = true_instances(regions, true_maps(folder, scene))
     word = folder.parent.name if folder.parent.name.endswith("-series") else folder.name
-    return Given(folder.name, word.split("-")[0], regions, true_instances(regions, maps), scene.cameras)
+    return Given(folder.name, word.split("-")[0], regions, leaf, scene.cameras)
 
 
 def choose_given(matched: Masks, cameras: Cameras) -> Masks:

@@ -87,11 +87,11 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
     return Study(name, table, candidates, drawn, Photos(scene), truth, leaf, of_candidate)
 
 
-def true_maps(folder: Path, scene: Scene) -> list[np.ndarray]:
-    """V true label maps, in the frames of the undistorted photos."""
+def true_maps(folder: Path, scene: Scene, kind: str = "truth") -> list[np.ndarray]:
+    """V true label maps of leaves, or of `organs`, in the frames of the undistorted photos."""
     maps = []
     for view, size, K in zip(scene.views, scene.cameras.sizes.tolist(), scene.cameras.K, strict=True):
-        maps.append(undistort(read_label_png(folder / "truth" / f"{view.name}.png", *size), view.lens, K.numpy()))
+        maps.append(undistort(read_label_png(folder / kind / f"{view.name}.png", *size), view.lens, K.numpy()))
     return maps
 
 

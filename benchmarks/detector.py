@@ -77,21 +77,11 @@ def count_and_dice(
 
     Scharr et al., "Leaf segmentation in plant phenotyping: a collation study", Machine Vision and Applications 2016.
 
-    Means over the photos. Categories are not told apart, and ignored areas (crowds) are left out of the truth.
-
-    Args:
-        truth: annotations of the true instances, see `annotate_truth`.
-        detections: annotations with "score", see `annotate_detections`; their masks may overlap.
-        num_images: image ids are 0..num_images - 1.
-        min_score: detections that score less do not count.
-
-    Returns:
-        "sbd": the smaller of the mean best Dice of the true masks among the detections and the reverse, in [0, 1]; 1
-        for a photo without leaves and detections, 0 for one with only either. "count_difference": detections minus
-        leaves. "absolute_count_difference": its absolute value, photo by photo.
-
-    Raises:
-        ValueError: no images.
+    Means over the photos, whose image ids are 0..num_images - 1. Categories are not told apart, and ignored areas
+    (crowds) are left out of the truth. Masks of detections may overlap. "sbd" is the smaller of the mean best Dice of
+    the true masks among the detections and the reverse, in [0, 1]; 1 for a photo without leaves and detections, 0 for
+    one with only either. "count_difference" is detections minus leaves, "absolute_count_difference" its absolute value,
+    photo by photo. Raises ValueError: no images.
     """
     if num_images < 1:
         raise ValueError("no images, expected at least one")

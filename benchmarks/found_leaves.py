@@ -15,16 +15,8 @@ FOUND_IOU = 0.5
 
 
 def credit_masks(regions: Regions, scores: Tensor, truth: Sequence[np.ndarray]) -> Tensor:
-    """The leaf that each mask is credited with.
-
-    Args:
-        regions: N masks in V views.
-        scores: (N,); of several masks of one leaf in one view the one with the highest score gets it.
-        truth: V label maps of the true leaves.
-
-    Returns:
-        (N,) int64, 0 for masks that find no leaf, or one that is taken.
-    """
+    """(N,) int64, the leaf that each of N masks is credited with, 0 for masks that find no leaf, or one that is taken:
+    of several masks of one leaf in one view the one with the highest score gets it."""
     leaf = tied_instances(regions, truth, min_iou=FOUND_IOU)
     taken: set[tuple[int, int]] = set()
     for index in scores.argsort(descending=True, stable=True).tolist():
@@ -43,17 +35,8 @@ def is_found(truth: Regions, regions: Regions, credited: Tensor) -> Tensor:
 
 
 def tied_instances(regions: Regions, truth: Sequence[np.ndarray], *, min_iou: float = 0.5) -> Tensor:
-    """The true instance that each region covers well enough to count as found.
-
-    Args:
-        regions: D regions, as a detector finds them.
-        truth: V label maps (H, W): 0 = no instance, 65535 = ignore.
-        min_iou: least IoU with the visible part of the instance.
-
-    Returns:
-        (D,) int64 on the CPU: the instance with the largest IoU; 0 where that is below `min_iou`. Two regions may be
-        tied to one instance.
-    """
+    """(D,) int64 on the CPU: the true instance (65535 = ignore) with whose visible part each region has the largest
+    IoU; 0 where that is below `min_iou`. Two regions may be tied to one instance."""
     sizes = [np.bincount(labels.ravel(), minlength=1) for labels in truth]
     ids = []
     for view, (labels, mask) in zip(regions.view_index.tolist(), region_crops(regions, truth), strict=True):

@@ -7,6 +7,7 @@ The 16 cells of the evaluation are {4, 8, 16, 32} leaves x {3, 5, 10, 20} views,
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -55,20 +56,31 @@ class LabelledScene:
 
 def load_maps(spec: SceneSpec, cache: Path) -> LabelledScene:
     """A scene of the preset "paper-eval"; rendered when it is not in the cache."""
-    path = cache / "maps" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
-    if not path.exists():
+
+    def render() -> dict[str, np.ndarray]:
         scene = render_maps(spec)
         poses = {name: getattr(scene.cameras, name).numpy() for name in ("K", "R", "t", "sizes")}
-        path.parent.mkdir(parents=True, exist_ok=True)
+        return {"true": scene.true, "degraded": scene.degraded, **poses}
+
+    arrays = _load_arrays(cache / "maps", spec, render)
+    cameras = Cameras(**{name: torch.from_numpy(arrays[name]) for name in ("K", "R", "t", "sizes")})
+    return LabelledScene(arrays["true"], arrays["degraded"], cameras)
+
+
+def _load_arrays(folder: Path, spec: SceneSpec, make: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Load the arrays of a scene, and make them first if they are not there."""
+    path = folder / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
+    if not path.exists():
+        arrays = make()
+        folder.mkdir(parents=True, exist_ok=True)
 
         def save(partial: Path) -> None:
             with partial.open("wb") as file:
-                np.savez_compressed(file, true=scene.true, degraded=scene.degraded, **poses)
+                np.savez_compressed(file, allow_pickle=False, **arrays)
 
         write_whole(path, save)
     with np.load(path) as saved:
-        cameras = Cameras(**{name: torch.from_numpy(saved[name]) for name in ("K", "R", "t", "sizes")})
-        return LabelledScene(saved["true"], saved["degraded"], cameras)
+        return dict(saved)
 
 
 def render_maps(spec: SceneSpec) -> LabelledScene:
@@ -82,46 +94,33 @@ def render_maps(spec: SceneSpec) -> LabelledScene:
 
 def load_photos(spec: SceneSpec, cache: Path) -> np.ndarray:
     """(V, H, W, 3) uint8, the photos of a scene as `write_scene` writes them; rendered when not in the cache."""
-    path = cache / "photos" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
-    if not path.exists():
+
+    def render() -> dict[str, np.ndarray]:
         plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
         cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
         stage = build_stage(plant, seed=spec.seed)
-        shots = [render_stage(stage, cameras, view).rgb for view in range(len(cameras))]
-        path.parent.mkdir(parents=True, exist_ok=True)
+        photos = []
         with TemporaryDirectory() as folder:
-            files = [Path(folder) / f"{view:03d}.jpg" for view in range(len(shots))]
-            for file, shot in zip(files, shots, strict=True):
-                write_jpeg(file, shot)
-            photos = np.stack([read_rgb(file) for file in files])
+            for view in range(len(cameras)):
+                write_jpeg(Path(folder) / "photo.jpg", render_stage(stage, cameras, view).rgb)
+                photos.append(read_rgb(Path(folder) / "photo.jpg"))
+        return {"photos": np.stack(photos)}
 
-        def save(partial: Path) -> None:
-            with partial.open("wb") as file:
-                np.savez_compressed(file, photos=photos)
-
-        write_whole(path, save)
-    with np.load(path) as saved:
-        loaded: np.ndarray = saved["photos"]
-        return loaded
+    return _load_arrays(cache / "photos", spec, render)["photos"]
 
 
 def load_detected(spec: SceneSpec, cache: Path) -> Regions:
     """What the shipped detector finds in a scene with exact poses, loop included; detected when not in the cache."""
-    path = cache / "detected" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
     names = ("view_index", "boxes", "crops", "labels")
-    if not path.exists():
+
+    def detect() -> dict[str, np.ndarray]:
         photos = [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in load_photos(spec, cache)]
         model = MultiViewMaskRCNN(load_detector("leaf-lite", min_score=DetectConfig.min_score))
-        found = model.find_regions(photos, load_maps(spec, cache).cameras).masks.regions
-        path.parent.mkdir(parents=True, exist_ok=True)
+        regions = model.find_regions(photos, load_maps(spec, cache).cameras).masks.regions
+        return {name: getattr(regions, name).numpy() for name in names}
 
-        def save(partial: Path) -> None:
-            with partial.open("wb") as file:
-                np.savez_compressed(file, **{name: getattr(found, name).numpy() for name in names})
-
-        write_whole(path, save)
-    with np.load(path) as saved:
-        return Regions(**{name: torch.from_numpy(saved[name]) for name in names}, num_views=spec.num_views)
+    arrays = _load_arrays(cache / "detected", spec, detect)
+    return Regions(**{name: torch.from_numpy(arrays[name]) for name in names}, num_views=spec.num_views)
 
 
 def visible_ids(plant: SimulatedPlant, cameras: Cameras) -> np.ndarray:

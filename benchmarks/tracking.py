@@ -47,11 +47,7 @@ from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
 from mvseg.simulation.blades import BLADE_COLUMNS
 from mvseg.simulation.growth import SimulatedPlant
-from mvseg.simulation.series import (
-    SeriesSpec,
-    draw_specs,
-    grow_series,
-)
+from mvseg.simulation.series import SeriesSpec, draw_specs, grow_series
 from mvseg.tracking.dates import Number, PlantOnDate, SeenLeaf, read_date, see_surface
 from mvseg.tracking.leaves import DateLeaves, leaves_of
 from mvseg.tracking.numbers import OBSERVATIONS
@@ -151,11 +147,8 @@ def measure(truth: Labels, found: Labels) -> dict[str, float]:
             for date, track in seen:
                 by_track.setdefault(track, []).append((date, leaf))
         found_ends = {(s[1], s[0]) for s in (sorted(seen)[side] for seen in by_track.values()) if s[0] != edge}
-        ends[name] = (
-            2 * len(true_ends & found_ends) / max(len(true_ends) + len(found_ends), 1)
-            if true_ends or found_ends
-            else 1.0
-        )
+        num_ends = len(true_ends) + len(found_ends)
+        ends[name] = 2 * len(true_ends & found_ends) / num_ends if num_ends else 1.0
     return {
         "short": float(np.mean(steps)) if steps else 1.0,
         "long": float(np.mean(whole)),

@@ -81,7 +81,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
         *(f"overlay/{name}" for name in views),
         *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
         *("before_edits.bin", "instances.json", "report.html", "run.json", "scene.glb", "surfaces.npz"),
-        *("traits.csv", "traits_wide.csv", "nodes.csv"),
+        *("traits.csv", "traits_wide.csv", "nodes.csv", "plant.json"),
     }
     leaf_of_label: dict[int, set[int]] = {}
     for name in views:

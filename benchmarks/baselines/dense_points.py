@@ -47,10 +47,8 @@ class DensePoints:
 def sgbm_points(scene: Scene) -> DensePoints:
     """Points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; backend "sgbm".
 
-    There are none when no two views are within 25 degrees of each other.
-
-    Raises:
-        InputError: a photo is missing or broken.
+    There are none when no two views are within 25 degrees of each other. Raises InputError: a photo is missing or
+    broken.
     """
     photos, cameras = read_small_photos(scene)
     depths = sgbm_depths([cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in photos], cameras)
@@ -168,11 +166,8 @@ class Workspace:
 
 
 def fuse(workspace: Path, options: pycolmap.StereoFusionOptions) -> Tensor:
-    """(P, 3) float64: the points that COLMAP fuses from the depth and normal maps in a dense workspace.
-
-    Raises:
-        InputError: the workspace cannot be read.
-    """
+    """(P, 3) float64: the points that COLMAP fuses from the depth and normal maps in a dense workspace. Raises
+    InputError: the workspace cannot be read."""
     with tempfile.TemporaryDirectory(prefix="mvseg-") as output:
         options.num_threads = 1  # with more, the points depend on which thread comes first
         quiet = pycolmap.logging.minloglevel

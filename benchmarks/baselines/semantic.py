@@ -15,18 +15,9 @@ def reconstruct_semantic(
     """The voxels of all leaves together: "we unified the silhouettes of all leaves" (Sec. 4.3).
 
     A voxel is occupied when, of the views that show any leaf, more than a share of `config.threshold` have a mask
-    there. Give a voxel size to compare with instances: the voxel budget is for the whole plant here.
-
-    Args:
-        regions: D regions; ids are not needed.
-        scene: V cameras.
-        config: threshold, voxel size (world units) or voxel budget.
-
-    Returns:
-        The grid; None when fewer than two views show anything, or no point has enough votes.
-
-    Raises:
-        InputError: regions and cameras of different numbers of views; see also `back_project`.
+    there. Give a voxel size to compare with instances: the voxel budget is for the whole plant here. None when fewer
+    than two views show anything, or no point has enough votes. Raises InputError: regions and cameras of different
+    numbers of views; see also `back_project`.
     """
     if len(scene.cameras) != regions.num_views:
         message = f"regions of {regions.num_views} views with {len(scene.cameras)} cameras"

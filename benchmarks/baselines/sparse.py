@@ -40,19 +40,9 @@ def match_sparse(regions: Regions, scene: Scene, config: MatchConfig = MatchConf
     """Match regions by the keypoints that they share (Sec. 4.2, "sparse feature correspondences").
 
     The paper's AKAZE is used where OpenCV has it: 4.x, or 5 with its contributed modules. Plain OpenCV 5 has only SIFT
-    left, which then takes its place. The method says which one ran: tables must not mix the two.
-
-    Args:
-        regions: D regions in V views.
-        scene: V >= 2 cameras with their photos.
-        config: see `match_graph`.
-
-    Returns:
-        The matching, method "sparse (akaze)" or "sparse (sift)". Regions that share no keypoint with any are -1.
-
-    Raises:
-        InputError: fewer than two views, regions and cameras of different numbers of views, or a photo that is missing
-            or broken.
+    left, which then takes its place. The method, "sparse (akaze)" or "sparse (sift)", says which one ran: tables must
+    not mix the two. Regions that share no keypoint with any are -1. Raises InputError: fewer than two views, regions
+    and cameras of different numbers of views, or a photo that is missing or broken.
     """
     check_views(regions, scene.cameras)
     detector, name = keypoint_detector()
@@ -103,11 +93,8 @@ def match_keypoints(first: Keypoints, second: Keypoints) -> Tensor:
 def keypoint_graph(regions: Regions, cameras: Cameras, keypoints: list[Keypoints]) -> Affinity:
     """An edge from each region to the region of each other view that it shares most keypoints with, if any.
 
-    Args:
-        regions: D regions; where they overlap a keypoint belongs to the smallest. Where several regions share equally
-            many, each gets an edge: the order of the regions must not matter.
-        cameras: V cameras, for the sizes of the images.
-        keypoints: V, those of each view.
+    Where regions overlap a keypoint belongs to the smallest. Where several regions share equally many, each gets an
+    edge: the order of the regions must not matter.
     """
     sizes = cameras.sizes.tolist()
     owners = [keypoint_owners(regions, points, view=view, size=sizes[view]) for view, points in enumerate(keypoints)]

@@ -201,17 +201,10 @@ def disparity(left: np.ndarray, right: np.ndarray, search: tuple[int, int]) -> n
 
 
 def sgbm_depths(photos: list[np.ndarray], cameras: Cameras) -> list[np.ndarray]:
-    """Depth maps of all views.
+    """V maps (H, W) float32 of photos (H, W) uint8 grey: depth along the view's +z in world units, 0 = unknown.
 
-    The depth of a view is the median over its pairs; it is kept where the depth of another view agrees within 1 %.
-
-    Args:
-        photos: V images (H, W) uint8 grey, of the sizes of the cameras.
-        cameras: V cameras.
-
-    Returns:
-        V maps (H, W) float32, depth along the view's +z in world units, 0 = unknown. A view without a neighbour that is
-        near enough is 0 everywhere.
+    The depth of a view is the median over its pairs; it is kept where the depth of another view agrees within 1 %. A
+    view without a neighbour that is near enough is 0 everywhere.
     """
     cameras = cameras.to("cpu")
     ball = seen_ball(cameras)

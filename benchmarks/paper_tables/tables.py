@@ -183,14 +183,10 @@ def table_rules(plan: Plan) -> str:
         if name in shapes:
             for threshold in THRESHOLDS:
                 text = f"{threshold:g}"
-                rows.append([kind, rule, f"> {text}", *split_cells(shapes[name], text)])
+                cells = [average(shapes[name], measure(text, key)).text(3) for key in HALVES]
+                rows.append([kind, rule, f"> {text}", *cells])
     table = markdown_table(["masks", "rule", "threshold", *HALVES], rows)
     return f"{count_scenes(shapes, plan)}\n\n{table}"
-
-
-def split_cells(records: Sequence[Record], threshold: str) -> list[str]:
-    """The averages of `HALVES`."""
-    return [average(records, measure(threshold, key)).text(3) for key in HALVES]
 
 
 def table_numbers(plan: Plan) -> str:
@@ -200,12 +196,9 @@ def table_numbers(plan: Plan) -> str:
     records = {kind: read_records(plan.records / "numbers" / slug(kind), specs) for kind in kinds}
     rows = []
     for rule in RULES:
-        row = [rule]
-        for kind in kinds:
-            for key, decimals in (("s_match", 3), ("e_k", 2), ("ari", 3)):
-                row.append(average(records[kind], measure(rule, key)).text(decimals))
-        rows.append(row)
-    table = markdown_table(["k", *(f"{kind}: {name}" for kind in kinds for name in ("s_match", "e_k", "ARI"))], rows)
+        cells = [average(records[kind], measure(rule, key)).text(n) for kind in kinds for key, n in MEASURES.values()]
+        rows.append([rule, *cells])
+    table = markdown_table(["k", *(f"{kind}: {name}" for kind in kinds for name in MEASURES)], rows)
     return f"{len(records['true'])} of {len(specs)} scenes.\n\n{table}"
 
 

@@ -6,6 +6,7 @@ is up; a scene whose cameras do not state unit or up keeps its own.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -13,19 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
-from mvseg.formats.text_file import short_number
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
+from mvseg.results.plant_graph import leaf_extras, plant_graph
 from mvseg.results.result import Result
 from mvseg.results.shapes_file import SURFACES_FILE, VOXELS_FILE, write_surfaces, write_voxels
 from mvseg.results.stem_shapes import parts_of
 from mvseg.scene import Scene
-from mvseg.traits.measure import Traits
+from mvseg.system.atomic import write_text_whole
 from mvseg.traits.table import write_long, write_nodes, write_wide
 from mvseg.traits.up import level_frame
 
-NODES_FILE = "nodes.csv"
+NODES_FILE, GRAPH_FILE = "nodes.csv", "plant.json"
 MAX_FACES = 4000  # limit: max. triangles of a leaf in scene.glb; its own file has all of them
 METRES = {
     "m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6,
@@ -37,7 +38,7 @@ METRES = {
 
 def write_plant(result: Result, folder: Path) -> None:
     """Write surfaces.npz, voxels.npz, leaves/*.ply, scene.glb and, where traits were measured, traits.csv,
-    traits_wide.csv and, where a stem was found, nodes.csv.
+    traits_wide.csv, plant.json and, where a stem was found, nodes.csv.
 
     Meshes are of credible surfaces, or else of voxels. If a leaf has both, its voxels get their own file.
     """
@@ -58,11 +59,14 @@ def write_plant(result: Result, folder: Path) -> None:
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
     for part in parts_of(result):
         meshes[part.name], colors[part.name] = part.mesh(), part.color
-    about, extras = describe_world(result.scene), leaf_extras(result.traits)
+    leaves = () if result.traits is None else result.traits.leaves
+    about, extras = describe_world(result.scene), {f"leaf_{leaf.leaf:03d}": leaf_extras(leaf) for leaf in leaves}
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
     if result.traits is not None:
         write_long(folder / "traits.csv", result.traits)
         write_wide(folder / "traits_wide.csv", result.traits)
+        graph = json.dumps(plant_graph(result.traits), indent=1, allow_nan=False)
+        write_text_whole(folder / GRAPH_FILE, graph + "\n")
         if result.traits.stems:
             write_nodes(folder / NODES_FILE, result.traits)
 
@@ -85,22 +89,3 @@ def describe_world(scene: Scene) -> dict[str, Any]:
     up = None if scene.up is None else list(scene.up)
     placed = {"is_in_metres": is_known, "is_y_up": up is not None}
     return {"plant": scene.name, "unit": scene.unit or None, "up": up, **placed}
-
-
-def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
-    """{name of a leaf's node: its extras}: id, unit, method, quality, and its numbers with standard deviations."""
-    extras: dict[str, dict[str, Any]] = {}
-    if traits is None:
-        return extras
-    for leaf in traits.leaves:
-        numbers = {name: number for name, number in leaf.numbers.items() if number.exists}
-        extras[f"leaf_{leaf.leaf:03d}"] = {
-            "leaf": leaf.leaf,
-            "unit": traits.unit or None,
-            "method": leaf.method,
-            "use": leaf.use,
-            "quality": leaf.quality,
-            "traits": {name: short_number(number.value) for name, number in numbers.items()},
-            "sd": {name: short_number(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
-        }
-    return extras

@@ -20,16 +20,8 @@ STEM_WIDTH, PETIOLE_WIDTH = 0.012, 0.006  # definition: radius where it is not k
 
 @dataclass(frozen=True, eq=False)
 class StemPart:
-    """A stem, or the petiole of a leaf.
-
-    Attributes:
-        name: of its node in glTF.
-        leaf: that a petiole leads to; None for a stem.
-        points: (P, 3) along it.
-        radius: (P,).
-        color: RGB, 0 to 255.
-        is_guessed: a petiole, or a stem that is less likely than `SURE_STEM`.
-    """
+    """A stem (`leaf` is None), or the petiole of a leaf, along points (P, 3) with radii (P,). `name` is that of its
+    node in glTF, `color` RGB, 0 to 255. Petioles, and stems less likely than `SURE_STEM`, are guessed."""
 
     name: str
     leaf: int | None

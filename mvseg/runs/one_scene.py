@@ -44,7 +44,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     sweep_abandoned(place)
     request = request.with_found()
     names = ("instances.json", *((REPORT_FILE,) if request.config.report else ()))
-    names += ("scene.glb", "traits.csv", "traits_wide.csv") if request.config.reconstruct is not None else ()
+    names += ("plant.json", "scene.glb", "traits.csv", "traits_wide.csv") if request.config.reconstruct else ()
     output = Output("result", (request.scene,), request.inputs, overwrite=request.overwrite, names=names)
     check_out(out, output)
     replaces = " (in place of an earlier result)" if place.is_dir() and any(place.iterdir()) else ""

@@ -170,13 +170,7 @@ def measure_plant(
     appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: numbers["visible_share"].value for instance, numbers in appearance.items()}
     chances = {instance: chance for instance, chance in stem_chances(surfaces or {}).items() if instance not in stems}
-    rejected = find_rejected(
-        every,
-        config=config,
-        sure_views=sure_views,
-        visible_shares=visible,
-        stems=chances,
-    )
+    rejected = find_rejected(every, config=config, sure_views=sure_views, visible_shares=visible, stems=chances)
     rejected |= {instance: Rejection("stem", "its masks are of the category of stems") for instance in stems}
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     plant_stems: tuple[Stem, ...] = ()

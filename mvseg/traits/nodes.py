@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class Node:
     Attributes:
         number: of the node, 1 for the lowest one of its stem; several leaves may share it.
         leaves_per_node: how many.
-        rank: 1 for the lowest leaf of the stem, counted upwards; leaves of one node in the order of their ids.
+        rank: 1 for the lowest leaf of the stem, counted upwards, also among the leaves of one node.
         place, base: (x, y, z) of the node on the axis, and of the blade.
         height: of the node along the axis, from the foot of the stem or, where that is not known, from the lowest node.
         internode: along the axis, from the node below.
@@ -57,13 +57,8 @@ class Node:
 
 @dataclass(frozen=True)
 class Phyllotaxis:
-    """How leaves follow each other around a stem.
-
-    Attributes:
-        name: "distichous", "decussate", "spiral", or "unclear".
-        angle: divergence in degrees: 180, 90 from pair to pair, or that of the spiral; NaN where it is unclear.
-        probability: of this one among all of them.
-    """
+    """How leaves follow each other around a stem: "distichous", "decussate", "spiral", or "unclear". `angle` is the
+    divergence in degrees, 180, 90 from pair to pair, or that of the spiral, and NaN where it is unclear."""
 
     name: str
     angle: float
@@ -137,8 +132,9 @@ def measure_stem(
     extended ends have no node. `frame` has the (3, 3) rows east, north, up (`level_frame`); None: azimuths start
     somewhere. With `knows_foot` heights start with the axis, not the lowest node."""
     leaves = _place_leaves(axis, bases, frame)
+    bare = Stem(number, axis, source, (), UNCLEAR, probability, tells_up)
     if not len(leaves.ids):
-        return Stem(number, axis, source, (), UNCLEAR, probability, tells_up)
+        return bare
     phyllotaxis, node_of = suggest_phyllotaxis(leaves.azimuth, leaves.azimuth_sd, leaves.along, leaves.along_sd)
     counts, weights = np.bincount(node_of), 1 / leaves.along_sd**2
     total = np.bincount(node_of, weights)
@@ -176,15 +172,7 @@ def measure_stem(
                 node_azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
             )
         )
-    return Stem(
-        number=number,
-        axis=axis,
-        source=source,
-        nodes=tuple(nodes),
-        phyllotaxis=phyllotaxis,
-        probability=probability,
-        tells_up=tells_up,
-    )
+    return replace(bare, nodes=tuple(nodes), phyllotaxis=phyllotaxis)
 
 
 def _place_leaves(axis: StemAxis, bases: LeafBases, frame: Floats | None) -> _Places:
@@ -315,6 +303,4 @@ def _pair_gaps(height: Floats, height_sd: Floats, first: int) -> float:
     scale = max(float(np.median(between)) if len(between) else float(gaps.mean()), 1e-12)
     sd = np.hypot(PAIR_GAP * scale, np.hypot(height_sd[1:], height_sd[:-1]))[is_within]
     within = -0.5 * (gaps[is_within] / sd) ** 2 - np.log(sd * np.sqrt(np.pi / 2))
-    logs = np.log(np.maximum(between / scale, 1e-2))
-    rest = -0.5 * (logs / GAP_SD) ** 2 - np.log(GAP_SD * np.sqrt(2 * np.pi)) - np.log(scale) - logs
-    return float(within.sum() + rest.sum())
+    return float(within.sum()) + (_gap_evidence(between) if len(between) else 0.0)

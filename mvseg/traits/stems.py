@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -74,18 +75,16 @@ def find_stems(
     upward = find_upward(cameras) if frame is None else frame[2]
     if stems := _of_masks(of_masks, surfaces, frame, upward):
         return stems
-    axes = axes_of_bases(surfaces, upward)
-    if frame is not None:
-        axes = tuple(each for each in axes if _rises(each.axis, frame[2]))
+    axes = [each for each in axes_of_bases(surfaces, upward) if frame is None or _rises(each.axis, frame[2])]
     if not photos.exist:
-        return _of_bases(axes, [float(expit(PRIOR))] * len(axes), frame)
+        return _of_bases([(each, float(expit(PRIOR))) for each in axes], frame)
     plant = see_plant(surfaces, masks, cameras, photos=photos)
-    chances, visible = zip(*(plant.stem_chance(each.axis.points) for each in axes), strict=True) if axes else ((), ())
-    likely = [number for number, chance in enumerate(chances) if chance > 0.5]
-    carried = sum(int(axes[number].is_near.sum()) for number in likely) / len(surfaces)
+    chances = [plant.stem_chance(each.axis.points) for each in axes]
+    likely = [(axis, chance) for axis, (chance, _) in zip(axes, chances, strict=True) if chance > 0.5]
+    carried = sum(len(axis.bases) for axis, _ in likely) / len(surfaces)
     if carried >= AXES.near_share:  # else what is left of several axes may stand in free air
-        tells_up = len(axes) == 1 and carried >= UP_LEAVES and visible[0] >= UP_SEEN
-        return _of_bases([axes[each] for each in likely], [chances[each] for each in likely], frame, tells_up=tells_up)
+        tells_up = len(axes) == 1 and carried >= UP_LEAVES and chances[0][1] >= UP_SEEN
+        return _of_bases(likely, frame, tells_up=tells_up)
     path = find_path(plant.cells, plant.leaves)
     if path is None or (chance := plant.stem_chance(path.points)[0]) <= 0.5:
         return ()
@@ -240,15 +239,13 @@ def _is_reversed(axis: StemAxis, upward: Floats | None, leaves: LeafBases) -> bo
 
 
 def _of_bases(
-    axes: Sequence[BaseAxis], chances: Sequence[float], frame: Floats | None, *, tells_up: bool = False
+    axes: Sequence[tuple[BaseAxis, float]], frame: Floats | None, *, tells_up: bool = False
 ) -> tuple[Stem, ...]:
+    measure = partial(measure_stem, frame=frame, source="leaf bases", tells_up=tells_up)
     return tuple(
-        measure_stem(
-            each.axis, each.bases.select(each.is_near), frame=frame, source="leaf bases", number=number,
-            probability=chance, tells_up=tells_up,
-        )
-        for number, (each, chance) in enumerate(zip(axes, chances, strict=True), start=1)
-    )  # fmt: skip
+        measure(each.axis, each.bases, number=number, probability=chance)
+        for number, (each, chance) in enumerate(axes, start=1)
+    )
 
 
 def _of_path(

@@ -64,7 +64,8 @@ IDS_FILES = {
     "run.json",
 }
 SHAPE_FILES = {
-    *(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv", "traits_wide.csv", "voxels.npz"
+    *(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)),
+    "plant.json", "scene.glb", "traits.csv", "traits_wide.csv", "voxels.npz",
 }  # fmt: skip
 
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from blade_scene import ring_cameras
-from mvseg.results.plant_files import describe_world, gltf_from_world, leaf_extras
+from mvseg.results.plant_files import describe_world, gltf_from_world
+from mvseg.results.plant_graph import leaf_extras
 from mvseg.scene import Scene, View
 from mvseg.traits.leaf import Measurement, missing
-from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.measure import LeafTraits
 
 SCENE = Scene("basil", tuple(View(str(view), Path("absent.png")) for view in range(2)), ring_cameras(2))
 
@@ -46,10 +47,8 @@ def test_leaves_say_their_numbers_and_no_others() -> None:
         "azimuth": missing("up is not known"),
     }
     doubts = {"first": "one", "second": "two"}
-    leaf = LeafTraits(leaf=12, numbers=numbers, method="surface", reasons=doubts, rejection=None)
-    traits = Traits(plant="basil", unit="mm", leaves=(leaf,), whole={}, up=None)
-    assert leaf_extras(traits) == {"leaf_012": {
+    leaf = LeafTraits(leaf=12, numbers=numbers, method="surface", reasons=doubts, rejection=None, unit="mm")
+    assert leaf_extras(leaf) == {
         "leaf": 12, "unit": "mm", "method": "surface", "use": "look", "quality": "one; two",
         "traits": {"area": 1234.57, "num_views": 4}, "sd": {"area": 12.3457},
-    }}  # fmt: skip
-    assert leaf_extras(None) == {}
+    }  # fmt: skip

@@ -15,9 +15,10 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def stem() -> Stem:
-    leaves = {n + 1: move(bent_blade(), turn_about(UP, 137.5 * n), shift=(0, 0, 20.0 * n)) for n in range(5)}
-    leaves = {leaf: move(each, np.eye(3), shift=tuple(9 * each.midrib[5].numpy() * [1, 1, 0] / 9))
-              for leaf, each in leaves.items()}  # fmt: skip
+    leaves = {}
+    for n in range(5):
+        leaf = move(bent_blade(), turn_about(UP, 137.5 * n), shift=(0, 0, 20.0 * n))
+        leaves[n + 1] = move(leaf, np.eye(3), shift=tuple(leaf.midrib[5].numpy() * [1, 1, 0]))
     (axis,) = axes_of_bases(leaves, UP)
     return measure_stem(axis.axis, axis.bases, frame=None, source="leaf bases")
 

@@ -144,9 +144,7 @@ def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     assert {name for name, n in leaf.numbers.items() if n.exists} == {"num_views", "sure_views", "iou"}
     assert leaf.numbers["area"].method == leaf.quality
     assert traits.whole["number_of_leaves"].value == 3
-    kept = measure_plant(
-        SCENE, matching, surfaces=surfaces, voxels={}, config=TraitsConfig(min_sure_views=1)
-    )  # fmt: skip
+    kept = measure_plant(SCENE, matching, surfaces=surfaces, voxels={}, config=TraitsConfig(min_sure_views=1))
     assert kept.rejected == {}
     assert kept.whole["number_of_leaves"].value == 4
 

@@ -100,18 +100,10 @@ def test_volume_of_a_hull_is_scipys() -> None:
     assert float(hull_volume(points)) == pytest.approx(ConvexHull(points.numpy()).volume)
 
 
-def test_one_flat_leaf_spans_no_volume() -> None:
-    found = measure({1: flat_leaf()}, num_leaves=1)
-    assert not found["convex_hull_volume"].exists
-    assert found["convex_hull_volume"].method == "not measured: the leaves span no volume"
-
-
-def test_without_up_what_needs_it_is_empty() -> None:
-    found = measure_whole(some_leaves(), None, num_leaves=3)
-    assert {name for name, number in found.items() if not number.exists} == {"height"}
-
-
-def test_without_surfaces_there_is_a_number_of_leaves_only() -> None:
-    found = measure_whole({}, FRAME, num_leaves=2)
-    assert found.keys() == {trait.name for trait in PLANT_TRAITS}
-    assert {name for name, number in found.items() if number.exists} == {"number_of_leaves"}
+def test_numbers_that_cannot_be_measured_are_empty() -> None:
+    flat = measure({1: flat_leaf()}, num_leaves=1)["convex_hull_volume"]
+    assert (flat.exists, flat.method) == (False, "not measured: the leaves span no volume")
+    no_up, no_leaves = measure_whole(some_leaves(), None, num_leaves=3), measure_whole({}, FRAME, num_leaves=2)
+    assert {name for name, number in no_up.items() if not number.exists} == {"height"}
+    assert no_leaves.keys() == {trait.name for trait in PLANT_TRAITS}
+    assert {name for name, number in no_leaves.items() if number.exists} == {"number_of_leaves"}

@@ -166,10 +166,3 @@ def test_traits_of_older_versions_are_passed_over(tmp_path: Path) -> None:
     found = read_traits(long, wide, plant="basil", unit="mm", up=None)
     assert found.whole.keys() == traits.whole.keys()
     assert found.leaves[0].numbers.keys() == traits.leaves[0].numbers.keys()
-
-
-def test_columns_have_a_cell_for_each_leaf() -> None:
-    traits = traits_of()
-    columns = traits.table()
-    assert {len(cells) for cells in columns.values()} == {len(traits.leaves)}
-    assert columns["area"][0] == traits.leaves[0].numbers["area"].value

@@ -87,17 +87,10 @@ def _ends(surfaces: Mapping[int, LeafSurface], *, is_reversed: bool) -> LeafBase
 
 @dataclass(frozen=True, eq=False)
 class BaseAxis:
-    """An axis, and the leaves that point to it.
-
-    Attributes:
-        axis: from the lowest node to the highest one; upwards.
-        bases: of N leaves, at the ends that are nearer to the axis.
-        is_near: (N,) bool, a leaf whose ray passes near it.
-    """
+    """An axis from the lowest node up to the highest one, and the bases of the leaves whose rays pass near it."""
 
     axis: StemAxis
     bases: LeafBases
-    is_near: NDArray[np.bool_]
 
 
 def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tuple[BaseAxis, ...]:
@@ -115,7 +108,7 @@ def axes_of_bases(surfaces: Mapping[int, LeafSurface], up: Floats | None) -> tup
         if axis is None:
             break
         axes.append(axis)
-        is_free[is_free] = ~axis.is_near
+        is_free &= ~np.isin(first.ids, axis.bases.ids)
     return tuple(axes) if len(first) and 1 - is_free.mean() >= AXES.near_share else ()
 
 
@@ -138,7 +131,7 @@ def _find_axis(first: LeafBases, second: LeafBases, up: Floats | None) -> BaseAx
         return None
     rising = bases.ahead[is_near].sum(0) if up is None else up
     axis = StemAxis.along(points if (points[-1] - points[0]) @ rising >= 0 else points[::-1])
-    return BaseAxis(axis, bases, is_near)
+    return BaseAxis(axis, bases.select(is_near))
 
 
 def _start_lines(first: LeafBases, second: LeafBases, up: Floats | None, *, size: float) -> list[tuple[Floats, Floats]]:
@@ -245,12 +238,7 @@ def _fit_axis(
 def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
     """Choose the end of each leaf that is nearer to a curve (P, 3)."""
     gaps = [np.linalg.norm(each.points[:, None] - curve, axis=2).min(1) for each in (first, second)]
-    is_second = gaps[1] < gaps[0]
-    chosen = {}
-    for field in fields(LeafBases):
-        one, other = getattr(first, field.name), getattr(second, field.name)
-        chosen[field.name] = np.where(is_second.reshape(-1, *[1] * (one.ndim - 1)), other, one)
-    return LeafBases(**chosen)
+    return LeafBases.join(first, second).select(np.arange(len(first)) + len(first) * (gaps[1] < gaps[0]))
 
 
 def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floats]:

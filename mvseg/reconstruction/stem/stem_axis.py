@@ -14,12 +14,8 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 @dataclass(frozen=True, eq=False)
 class StemAxis:
-    """One stem, or one internode of it.
-
-    Attributes:
-        points: (P, 3) from end to end, P >= 2.
-        radius: (P,); 0 where no mask shows how thick it is.
-    """
+    """One stem, or one internode of it: P >= 2 points (P, 3) from end to end, and the radius (P,) there, 0 where no
+    mask shows how thick it is."""
 
     points: Floats
     radius: Floats

@@ -22,13 +22,8 @@ from mvseg.reconstruction.stem.thin_parts import ThinCells
 
 @dataclass(frozen=True, eq=False)
 class StemPath:
-    """A line of thin cells that several leaves are joined to.
-
-    Attributes:
-        points: (P, 3) along it, smooth, from one end to the other.
-        cell: side of a cell.
-        petioles: {leaf: (n, 3) from the line to the leaf}, n >= 1.
-    """
+    """A line of thin cells that several leaves are joined to: (P, 3) smooth from one end to the other, the side of a
+    cell, and the petioles {leaf: (n, 3) from the line to the leaf}, n >= 1."""
 
     points: Floats
     cell: float
@@ -40,26 +35,26 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
     run. None where fewer than `THIN.least_leaves` leaves are joined, or their paths share no line."""
     if len(cells.points) < THIN.least_steps or len(leaves) < THIN.least_leaves:
         return None
-    graph = _Graph.of(cells, leaves)
-    cost = np.array([graph.cost_from(leaf)[0] for leaf in leaves])[:, len(cells.points) :]
+    graph, num_cells = _join_cells(cells, leaves), len(cells.points)
+    places = np.arange(num_cells, num_cells + len(leaves))
+    every, before = dijkstra(graph, directed=False, indices=places, return_predecessors=True)
+    cost = every[:, num_cells:]
     joined = np.isfinite(cost).sum(1)
     root = int(np.lexsort((np.where(np.isfinite(cost), cost, 0).sum(1), -joined))[0])
     if joined[root] < THIN.least_leaves:
         return None
-    trunk = _find_trunk(graph, list(leaves)[root])
-    points = _fit_line(cells, trunk)
+    points = _fit_line(cells, _find_trunk(before[root], num_cells))
     return None if points is None else StemPath(points, cells.size, _find_petioles(graph, cells, leaves, points))
 
 
-def _find_trunk(graph: _Graph, root: int) -> NDArray[np.int64]:
-    """(cells,) of the cheapest paths between leaves, how many lead through a cell, or do not, the fewer."""
-    _, before = graph.cost_from(root)
+def _find_trunk(before: NDArray, num_cells: int) -> NDArray[np.int64]:
+    """(cells,) of the cheapest paths between leaves, how many lead through a cell, or do not, the fewer. `before` has
+    the place before each on its path from one of the leaves."""
     used = np.zeros(len(before), np.int64)
-    joined = [leaf for leaf, index in graph.leaf_index.items() if before[index] >= 0]
-    for leaf in joined:
-        used[trace_path(before, graph.leaf_index[leaf])] += 1
-    num = len(joined) + 1
-    cells = used[: len(before) - len(graph.leaf_index)]
+    joined = num_cells + np.flatnonzero(before[num_cells:] >= 0)
+    for leaf in joined.tolist():
+        used[trace_path(before, leaf)] += 1
+    cells, num = used[:num_cells], len(joined) + 1
     return np.asarray(np.maximum(np.minimum(cells, num - cells), 1) - 1)
 
 
@@ -99,7 +94,9 @@ def _fit_line(cells: ThinCells, trunk: NDArray[np.int64]) -> Floats | None:
     return np.asarray(line + np.stack([np.ones_like(even), even, even**2], 1) @ bend)
 
 
-def _find_petioles(graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats) -> dict[int, Floats]:
+def _find_petioles(
+    graph: csr_matrix, cells: ThinCells, leaves: Mapping[int, Floats], line: Floats
+) -> dict[int, Floats]:
     """{leaf: (n, 3) the cheapest path from the line, or from where it goes on beyond its ends, to the leaf}."""
     ends = np.array([[line[0], line[3]], [line[-1], line[-4]]])
     ahead = ends[:, 0] - ends[:, 1]
@@ -110,9 +107,9 @@ def _find_petioles(graph: _Graph, cells: ThinCells, leaves: Mapping[int, Floats]
     sources = np.flatnonzero(gap < THIN.line_cells * cells.size + THIN.cone * away)  # the stem may bend there
     if not len(sources):
         return {}
-    cost, before, _ = dijkstra(graph.matrix, directed=False, indices=sources, min_only=True, return_predecessors=True)
+    cost, before, _ = dijkstra(graph, directed=False, indices=sources, min_only=True, return_predecessors=True)
     petioles = {}
-    for leaf, index in graph.leaf_index.items():
+    for index, leaf in enumerate(leaves, start=len(cells.points)):
         if np.isfinite(cost[index]):
             way = [place for place in trace_path(before, index) if place < len(cells.points)]
             end = leaves[leaf][cKDTree(leaves[leaf]).query(cells.points[way[-1]])[1]]
@@ -135,38 +132,24 @@ def _spread_cells(cells: ThinCells) -> NDArray:
     return order[first]
 
 
-@dataclass(frozen=True, eq=False)
-class _Graph:
-    """Cells and leaves; a leaf is next to all cells near its surface."""
-
-    matrix: csr_matrix
-    leaf_index: dict[int, int]
-
-    @staticmethod
-    def of(cells: ThinCells, leaves: Mapping[int, Floats]) -> _Graph:
-        near = cKDTree(cells.points).query_pairs(THIN.gap_cells * cells.size, output_type="ndarray")
-        # Leaves hide parts of a stem: long steps between a few cells lead across.
-        few = _spread_cells(cells)
-        far = few[cKDTree(cells.points[few]).query_pairs(THIN.bridge_cells * cells.size, output_type="ndarray")]
-        pairs = np.concatenate([near, far])
-        length = np.linalg.norm(cells.points[pairs[:, 0]] - cells.points[pairs[:, 1]], axis=1) / cells.size
-        # A gap costs more than its length, and cells that views doubt more than sure ones.
-        doubt = 1 + THIN.doubt_cost * (1 - cells.share[pairs].mean(1))
-        weight = [length**THIN.gap_power * doubt]
-        rows, columns = [pairs[:, 0]], [pairs[:, 1]]
-        index = {}
-        for number, (leaf, points) in enumerate(leaves.items()):
-            index[leaf] = len(cells.points) + number
-            gap, _ = cKDTree(points).query(cells.points, distance_upper_bound=THIN.touch_cells * cells.size)
-            near = np.flatnonzero(np.isfinite(gap))
-            rows.append(np.full(len(near), index[leaf]))
-            columns.append(near)
-            weight.append(THIN.touch_cost + (gap[near] / cells.size) ** THIN.gap_power)
-        size = len(cells.points) + len(leaves)
-        matrix = coo_matrix((np.concatenate(weight), (np.concatenate(rows), np.concatenate(columns))), (size, size))
-        return _Graph(matrix.tocsr(), index)
-
-    def cost_from(self, leaf: int) -> tuple[Floats, NDArray]:
-        """(cells + leaves,) costs of the cheapest paths from a leaf, and the place before each on its path."""
-        cost, before = dijkstra(self.matrix, directed=False, indices=self.leaf_index[leaf], return_predecessors=True)
-        return cost, before
+def _join_cells(cells: ThinCells, leaves: Mapping[int, Floats]) -> csr_matrix:
+    """Costs of steps between cells, and to leaves, which come after the cells; a leaf is next to all cells near it."""
+    near = cKDTree(cells.points).query_pairs(THIN.gap_cells * cells.size, output_type="ndarray")
+    # Leaves hide parts of a stem: long steps between a few cells lead across.
+    few = _spread_cells(cells)
+    far = few[cKDTree(cells.points[few]).query_pairs(THIN.bridge_cells * cells.size, output_type="ndarray")]
+    pairs = np.concatenate([near, far])
+    length = np.linalg.norm(cells.points[pairs[:, 0]] - cells.points[pairs[:, 1]], axis=1) / cells.size
+    # A gap costs more than its length, and cells that views doubt more than sure ones.
+    doubt = 1 + THIN.doubt_cost * (1 - cells.share[pairs].mean(1))
+    weight = [length**THIN.gap_power * doubt]
+    rows, columns = [pairs[:, 0]], [pairs[:, 1]]
+    for index, points in enumerate(leaves.values(), start=len(cells.points)):
+        gap, _ = cKDTree(points).query(cells.points, distance_upper_bound=THIN.touch_cells * cells.size)
+        near = np.flatnonzero(np.isfinite(gap))
+        rows.append(np.full(len(near), index))
+        columns.append(near)
+        weight.append(THIN.touch_cost + (gap[near] / cells.size) ** THIN.gap_power)
+    size = len(cells.points) + len(leaves)
+    steps = np.concatenate(weight), (np.concatenate(rows), np.concatenate(columns))
+    return coo_matrix(steps, (size, size)).tocsr()

@@ -63,13 +63,8 @@ def see_thin(photo: NDArray[np.uint8], is_leaf: NDArray[np.bool_], px_from_world
 
 @dataclass(frozen=True, eq=False)
 class ThinCells:
-    """Cells of space that show something thin.
-
-    Attributes:
-        points: (P, 3) their middles.
-        share: (P,) in [0, 1], mean over the views that look there.
-        size: side of a cell.
-    """
+    """Cells of space that show something thin: their middles (P, 3), the mean (P,) in [0, 1] of `ThinView.share` over
+    the views that look there, and the side of a cell."""
 
     points: Floats
     share: Floats
