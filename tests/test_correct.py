@@ -21,7 +21,6 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.corrections.file import FORMAT, Corrections, Outline, Reject, load_corrections, name_edits, parse_corrections
@@ -67,6 +66,8 @@ from served_result import (
     wait_until_computed,
 )
 
+Said, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -109,20 +110,6 @@ def test_an_edit_is_saved_computed_and_shown(served: CorrectionServer, folder: P
     assert wait_until_computed(served)["update"] == before["update"]
 
 
-def test_a_reload_shows_all_edits_that_were_saved(served: CorrectionServer) -> None:
-    """Otherwise the next edit would be saved without them."""
-    view, at = middle(served.corrector.opened, 0)
-    edits = [{"op": "reject", "view": view, "at": at}]
-    _, saved = save(served, edits)
-    state = wait_until_computed(served)
-    status, page = ask(served, "GET", "")
-    assert status == 200
-    data = json.loads(page.split('id="data">')[1].split("</script>")[0])
-    assert data["correct"]["edits"] == edits
-    assert data["correct"]["revision"] == saved["revision"] == state["revision"]
-    assert data["numMasks"] == state["update"]["numMasks"]
-
-
 def test_edits_that_another_page_has_changed_are_not_saved_over(served: CorrectionServer, folder: Path) -> None:
     view, at = middle(served.corrector.opened, 0)
     first, second = ([{"op": op, "view": view, "at": at}] for op in ("reject", "confirm"))
@@ -159,19 +146,6 @@ def test_a_file_that_another_program_has_changed_is_not_saved_over(served: Corre
     assert save(served, mine)[0] == 409
     (folder / "corrections.json").unlink()
     assert not ask(served, "GET", "state")[1]["isChanged"]
-
-
-def test_leaves_keep_their_numbers_when_one_goes_and_comes_back(served: CorrectionServer) -> None:
-    def numbers(state: dict[str, Any]) -> list[int]:
-        return [leaf["id"] for leaf in state["update"]["leaves"]]
-
-    before = wait_until_computed(served)
-    masks = [mask for view in before["update"]["views"] for mask in view["masks"] if mask["leaf"] == 1]
-    view, at = middle(served.corrector.opened, masks[0]["region"])
-    save(served, [{"op": "reject", "view": view, "at": at, "everywhere": True}])
-    assert numbers(wait_until_computed(served)) == [each for each in numbers(before) if each != 1]
-    save(served, [])
-    assert wait_until_computed(served)["update"] == before["update"]
 
 
 def test_numbers_go_to_most_pixels_and_new_leaves_get_new_ones() -> None:
@@ -218,25 +192,6 @@ def test_a_page_that_knows_all_waits_for_news(served: CorrectionServer) -> None:
     waiting.join()
 
 
-def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
-    opened = OpenResult(folder)
-    view, at = middle(opened, 1)
-    (folder / "corrections.json").write_bytes(text_of([{"op": "reject", "view": view, "at": at}]))
-    corrections = with_marks(opened.saved_corrections(), opened.scene, mark_photos(opened.photos))
-    shown, outcomes, _ = opened.recompute(corrections, lambda: False)
-    run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
-    assert outcomes == [""]
-    one, other = (  # the page keeps the numbers that the result has had
-        {tuple(sorted(name_regions(masks.regions.select(masks.instance_ids == leaf)))) for leaf in (1, 2, 3)}
-        for masks in (shown.masks, run.masks)
-    )
-    assert one == other
-    assert len(one) == 3
-    with pytest.raises(Cancelled):
-        opened.recompute(corrections, lambda: True)
-    (folder / "corrections.json").unlink()
-
-
 def test_edits_and_undo_end_where_a_fresh_run_does_bit_for_bit(tmp_path: Path) -> None:
     scene, config = write_scene(tmp_path / "balls"), RunConfig(reconstruct=ReconstructConfig(voxel_budget=500))
     run_one_scene(RunRequest(scene, scene / "masks", tmp_path / "result", config))
@@ -249,6 +204,8 @@ def test_edits_and_undo_end_where_a_fresh_run_does_bit_for_bit(tmp_path: Path) -
         run = run_scene(scene, scene / "masks", config, corrections=corrections)
         assert len(run.surfaces or {}) == (2 if unlike in edits else 3)
         assert surfaces_by_masks(shown) == surfaces_by_masks(run)
+    with pytest.raises(Cancelled):
+        opened.recompute(corrections, lambda: True)
 
 
 def surfaces_by_masks(result: Result) -> dict[tuple[str, ...], bytes]:
@@ -279,9 +236,7 @@ def test_what_the_run_warned_of_is_not_said_again(folder: Path, monkeypatch: pyt
     ]
 
 
-def test_it_opens_with_what_the_run_knew_before_edits(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_opens_with_what_the_run_knew_before_edits(folder: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     """And computes it where anything has changed: the photos, torch, or the file."""
     place, computed = tmp_path / "result", list[Any]()
     shutil.copytree(folder, place)
@@ -349,9 +304,7 @@ def test_a_body_that_is_too_large_is_not_read(served: CorrectionServer) -> None:
     assert "64 MiB" in answer["problem"]
 
 
-def test_an_edit_that_cannot_be_saved_says_so(
-    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_edit_that_cannot_be_saved_says_so(served: CorrectionServer, folder: Path, monkeypatch: Patch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
@@ -436,43 +389,23 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
         ({"refine_poses": True}, "its poses were refined by the masks, and will be those of the scene"),
         ({"detect": {"min_views": 1}}, "made with another min. number of photos"),
         ({"split_merged": True}, "masks of two leaves were cut in two, and will stay whole"),
+        ({"color_card": "find"}, "its colours were corrected by a colour card, and will be those of the photos"),
     ],
 )
 def test_a_result_made_with_options_that_are_gone(
-    options: dict[str, Any], sentence: str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    options: dict[str, Any], sentence: str | None, folder: Path, tmp_path: Path, capsys: Said
 ) -> None:
     out = shutil.copytree(folder, tmp_path / "result")
     run = json.loads((out / "run.json").read_text())
-    (out / "run.json").write_text(json.dumps(run | {"config": run["config"] | options}))
+    traits = {"unit": "mm", "up": None, "colors": [{"views": "*", "photo": "card.png"}]}
+    (out / "run.json").write_text(json.dumps(run | {"config": run["config"] | options, "traits": traits}))
     assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
     said = capsys.readouterr().err
     assert (sentence or "") in said
     assert sentence or not any(change in said for _, change in GONE.values())
 
 
-def test_a_result_whose_colours_a_card_corrected(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """By an option of earlier versions: the result is read, and is made again without it, which is said."""
-    out = shutil.copytree(folder, tmp_path / "result")
-    run = json.loads((out / "run.json").read_text())
-    card = {"views": "*", "matrix": [1, 0, 0, 0, 1, 0, 0, 0, 1], "delta_e": 0.5, "photo": "card.png"}
-    for option in (None, "find", [card]):
-        config = run["config"] | {"color_card": option}
-        changes = {"config": config, "traits": {"unit": "mm", "up": None, "colors": [card]}}
-        (out / "run.json").write_text(json.dumps(run | changes))
-        result = load_result(out)
-        assert result.run is not None
-        assert result.run.as_json()["traits"]["colors"] == [card]
-        assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
-        said = capsys.readouterr().err
-        assert ("its colours were corrected by a colour card, and will be those of the photos" in said) == bool(option)
-        assert "color_card" not in json.loads((tmp_path / "new" / "run.json").read_text())["config"]
-
-
-def test_a_folder_that_cannot_be_written_to(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_that_cannot_be_written_to(folder: Path, monkeypatch: Patch, capsys: Said) -> None:
     monkeypatch.setattr(os, "access", lambda *_: False)  # whoever runs the tests
     assert main(["correct", str(folder), "--no_browser"]) == 2
     said = capsys.readouterr().err
@@ -502,14 +435,13 @@ STARTED = """
 import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from mvseg.cli import main
+
 sys.exit(main())
 """
 
 
 @pytest.mark.slow
-def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(folder: Path, capsys: Said) -> None:
     """As a person starts it. Edits are on the disk before it answers, so no kill can take them; a second process is
     refused; and Ctrl-C may come while it computes, which torch answers by an abort."""
     command = [sys.executable, "-c", STARTED, "correct", str(folder), "--no_browser"]
@@ -554,7 +486,7 @@ def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> Non
 
 
 def test_edits_that_come_while_the_whole_result_is_made_are_kept(
-    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+    served: CorrectionServer, folder: Path, monkeypatch: Patch
 ) -> None:
     """Those of the page and those of another program; and one run is made at a time. The run is imitated: it replaces
     the folder by one with the edits that it found at its start."""
@@ -587,9 +519,7 @@ def test_edits_that_come_while_the_whole_result_is_made_are_kept(
     assert ask(served, "GET", "state")[1]["isChanged"]
 
 
-def test_a_detector_learns_beside_the_page(
-    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_detector_learns_beside_the_page(served: CorrectionServer, folder: Path, monkeypatch: Patch) -> None:
     """What is edited meanwhile is saved, and computed afterwards; the whole result is found by what was learned; and
     it can be undone."""
     lesson, (view, at) = Lesson(monkeypatch), middle(served.corrector.opened, 0)
@@ -636,9 +566,7 @@ def test_a_detector_learns_beside_the_page(
     ]
 
 
-def test_learning_that_is_cancelled_or_fails_changes_nothing(
-    served: CorrectionServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_learning_that_is_cancelled_or_fails_changes_nothing(served: CorrectionServer, monkeypatch: Patch) -> None:
     assert ask(served, "GET", "state")[1]["learning"] is None  # its masks were given
     status, refusal = ask(served, "POST", "learn")
     assert (status, refusal["problem"]) == (409, "No detector found these masks, so there is none that could learn.")
@@ -707,9 +635,7 @@ def test_outlines_say_where_their_leaf_was_found_or_why_not(drawn: str, stays: s
     assert tell_drawn(result, new=[], angles=np.full((4, 4), apart)) == []
 
 
-def test_inputs_that_changed_or_moved_since(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_inputs_that_changed_or_moved_since(tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     scene, elsewhere = write_scene(tmp_path / "here" / "balls"), tmp_path / "there"
     monkeypatch.chdir(tmp_path / "here")
     run_one_scene(RunRequest(Path("balls"), Path("masks"), Path("out"), RunConfig(reconstruct=None)))

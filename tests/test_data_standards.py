@@ -153,15 +153,6 @@ def test_wrong_tables_are_named(changes: dict[str, str], factors: str, facts: st
     assert not (tmp_path / "out").exists()
 
 
-def test_nothing_is_overwritten(traits: Path) -> None:
-    out = traits.with_name("mine")
-    out.mkdir()
-    for standard in ("miappe", "brapi"):
-        with pytest.raises(SystemExit, match="mine: exists already"):
-            convert([standard, str(traits), str(out)])
-    assert list(out.iterdir()) == []
-
-
 def test_what_is_no_batch_is_said(tmp_path: Path) -> None:
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
     for name, facts in (("other.csv", "is not tables/traits.csv of a batch"), ("absent.csv", "no such file")):

@@ -69,15 +69,6 @@ def test_each_small_detector(arch: str) -> None:
 
 
 @torch.no_grad()
-def test_one_photo(model: MaskRCNN, photos: list[Tensor]) -> None:
-    expected, pasted = detect(model, photos[0])
-    whole = expected | {"masks": torch.stack(list(pasted))}
-    with other_device() as device:
-        found, masks = detect(there(model, device), photos[0].to(device))
-        check(found | {"masks": torch.stack(list(masks))}, whole, device)
-
-
-@torch.no_grad()
 def test_nothing_found(model: MaskRCNN, photos: list[Tensor]) -> None:
     model.roi_heads.score_thresh = 1.0
     with other_device() as device:

@@ -3,12 +3,11 @@ do not depend on how the world stands."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from benchmarks.faults import Faults, degrade_labels
@@ -22,6 +21,7 @@ from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
+from turned_worlds import tell_otherwise
 from verified import verify_ids
 
 LEAST_ARI = {"basil-0729": 1.0, "basil-dense": 0.93, "maize-series/D54.9": 1.0}  # the second measured: 0.974
@@ -68,25 +68,14 @@ def test_surfaces_never_harm_ids_of_simulated_plants(family: str, seed: int) -> 
     assert found >= alone
 
 
-def stand_otherwise(cameras: Cameras, regions: Regions, order: Tensor) -> tuple[Cameras, Regions]:
-    """The same scene mirrored, turned and moved, in another unit, its views in another `order` (V,), its photos turned
-    by 90 degrees, pixel for pixel. The regions of a view keep their order."""
-    mirror = torch.diag(torch.tensor([-1.0, 1, 1], dtype=torch.float64))
-    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
-    world = torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix())
-    R, t = quarter @ mirror @ cameras.R @ mirror, (quarter @ mirror @ cameras.t[..., None])[..., 0]
-    K = cameras.K.clone()
-    # clockwise: what was at (u, v) of a mirrored photo of height H is at (H - v, u)
-    K[:, 0, 0], K[:, 1, 1] = cameras.K[:, 1, 1], cameras.K[:, 0, 0]
-    K[:, 0, 2], K[:, 1, 2] = cameras.sizes[:, 1] - cameras.K[:, 1, 2], cameras.sizes[:, 0] - cameras.K[:, 0, 2]
-    moved = Cameras(K=K, R=R @ world.T, t=0.01 * (t - (R @ world.T @ torch.tensor([70.0, -20, 5]).double())),
-                    sizes=cameras.sizes.flip(1))  # fmt: skip
-    maps = []
-    for view in order.tolist():
-        ids = torch.arange(1, len(regions) + 1)
-        labels = regions.label_map(view, ids, tuple(cameras.sizes[view].tolist())).numpy()
-        maps.append(np.rot90(labels[:, ::-1], -1))
-    return moved[order.tolist()], regions_from_label_maps([np.ascontiguousarray(each) for each in maps])
+def stand_otherwise(cameras: Cameras, regions: Regions, order: list[int]) -> tuple[Cameras, Regions]:
+    """The same scene mirrored, turned and moved, in another unit, its views in another `order`, its photos turned."""
+    ids = torch.arange(1, len(regions) + 1)
+    sizes = [tuple(cameras.sizes[view].tolist()) for view in order]
+    maps = [regions.label_map(view, ids, size).numpy() for view, size in zip(order, sizes, strict=True)]
+    maps, turned = tell_otherwise(maps, cameras[order])["all three"]
+    t = 0.01 * (turned.t - turned.R @ torch.tensor([70.0, -20, 5]).double())
+    return replace(turned, t=t), regions_from_label_maps(maps)
 
 
 @pytest.mark.slow
@@ -95,7 +84,7 @@ def stand_otherwise(cameras: Cameras, regions: Regions, order: Tensor) -> tuple[
 def test_ids_do_not_depend_on_how_the_world_stands(name: str, is_alone_the_same: bool, shared_data: Path) -> None:
     """Of the dense plant, those of the matcher alone do, in masks that it is not sure of: it casts few rays of each."""
     cameras, regions, _ = read(shared_data / name)
-    order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(4))
+    order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(4)).tolist()
     moved, turned = stand_otherwise(cameras, regions, order)
     row = turned.labels - 1  # of the same mask
     found, alone = zip(ids_with_and_without(cameras, regions), ids_with_and_without(moved, turned), strict=True)

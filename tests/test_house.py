@@ -118,7 +118,7 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 37_990, "benchmarks": 6_720, "tests": 35_600}
+BUDGET = {"mvseg": 37_990, "benchmarks": 6_720, "tests": 33_680}
 SLACK, MOST_CODE = 400, 22_032
 
 
@@ -222,19 +222,12 @@ def test_every_module_is_imported_by_another() -> None:
 @pytest.mark.parametrize(
     ("line", "room"),
     [
-        ("import mvseg.results.folder", "results"),
         ("import os, mvseg.results.folder as folder", "results"),
-        ("from mvseg.results import folder", "results"),
         ("from mvseg.results.folder import save_result", "results"),
         ("from ..results import folder", "results"),
-        ("from ..results.folder import save_result", "results"),
-        ("import mvseg", "__init__"),
         ("from mvseg import regions", "__init__"),
-        ("from .. import regions", "__init__"),
         ("def run():\n    import mvseg.pipeline", "pipeline"),
         ("if TYPE_CHECKING:\n    from mvseg.pipeline.run_scene import run_scene", "pipeline"),
-        ("try:\n    pass\nexcept ImportError:\n    from mvseg import cli", "__init__"),
-        ("class Lazy:\n    def run(self):\n        from ..cli import main", "cli"),
         ("from mvseg.matching.affinity import Affinity", "matching"),  # a room of the same floor
         ("from mvseg.attic import x", "attic"),  # a room that has no floor
     ],
@@ -248,11 +241,9 @@ def test_every_kind_of_forbidden_import_is_seen(line: str, room: str) -> None:
     ("module", "source"),
     [
         ("mvseg.formats.coco", "from . import lens\nfrom .rig import load\nimport mvseg.formats.mesh"),  # its own room
-        ("mvseg.formats.__init__", "from . import lens\nfrom .. errors import InputError"),
         ("mvseg.formats.coco", "import models\nfrom mvsegment import x\nimport mvsegment.results"),  # other packages
         ("mvseg.formats.coco", "from mvseg.scene import Scene\nfrom ..regions import Regions\nimport mvseg.demo"),
         ("mvseg.cli.infer", "import mvseg\nfrom mvseg.pipeline import run_scene\nfrom .batch import run_batch"),
-        ("mvseg.__init__", "from mvseg.pipeline.run_scene import run_scene\nfrom ._version import __version__"),
     ],
 )
 def test_imports_from_above_are_fine(module: str, source: str) -> None:
@@ -294,7 +285,7 @@ def test_numbers_of_a_room_stand_in_one_place() -> None:
     assert {module for module, names in heads.items() if names} == BESIDE
 
 
-MOST_NUMBERS, MOST_CHOSEN = 661, 336  # 550 and 200 are where they are to go
+MOST_NUMBERS, MOST_CHOSEN = 645, 335  # 550 and 200 are where they are to go
 WORDS = "definition", "limit", "fitted", "insensitive", "chosen"  # of numbers
 
 

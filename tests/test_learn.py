@@ -32,6 +32,9 @@ from mvseg.results.result import Learned
 from mvseg.training.view_labels import ViewLabels, label_views
 from warned import warns_of
 
+Patch = pytest.MonkeyPatch
+
+
 SIZE = 96
 
 
@@ -43,9 +46,7 @@ def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
 SEEN: dict[tuple[float, int], Plant] = {}  # by the scores and the number of leaves
 
 
-def see(
-    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, *, score: float = 0.2, leaves: int = 4, **options: Any
-) -> Plant:
+def see(leafy: LeafyScene, monkeypatch: Patch, *, score: float = 0.2, leaves: int = 4, **options: Any) -> Plant:
     """Leaves that a detector has found with these scores; the views chose all of them, which is done once."""
     regions = leafy.regions.select(leafy.regions.labels <= leaves)
     ids = regions.labels
@@ -93,13 +94,7 @@ def lower(plant: Plant, chance: float = 0.9) -> Plant:
     ],
 )
 def test_weights_stay_where_the_agreed_area_grows(
-    leafy: LeafyScene,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    rounds: Any,
-    growth: tuple[float, ...],
-    tried: int,
-    kept: int,
+    leafy: LeafyScene, monkeypatch: Patch, tmp_path: Path, rounds: Any, growth: tuple[float, ...], tried: int, kept: int
 ) -> None:
     plant = lower(see(leafy, monkeypatch, learn=rounds), 0.5)
     taught = teach(monkeypatch, *growth)
@@ -114,7 +109,7 @@ def test_weights_stay_where_the_agreed_area_grows(
 
 
 def test_a_known_species_is_not_learned_unless_somebody_asks(
-    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    leafy: LeafyScene, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     taught = teach(monkeypatch, 1.0)
     plant = see(leafy, monkeypatch, score=0.6)
@@ -143,7 +138,7 @@ def test_plants_that_the_shipped_detector_knows_are_not_learned(plant: str, shar
 
 @pytest.mark.parametrize("reason", ["few", "interrupt", "fails"])
 def test_what_was_there_stays_and_one_sentence_says_why(
-    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reason: str
+    leafy: LeafyScene, monkeypatch: Patch, tmp_path: Path, reason: str
 ) -> None:
     def stop(*_: object) -> Plant:
         raise KeyboardInterrupt if reason == "interrupt" else InputError("it tells several kinds apart")
@@ -167,7 +162,7 @@ def test_what_a_person_says_is_learned(leafy: LeafyScene, monkeypatch: pytest.Mo
 
 
 def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
-    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    leafy: LeafyScene, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     """A run that was cut off goes on from the weights; the next plant can use them."""
     made: list[int] = []

@@ -195,15 +195,6 @@ class TestDescribeRun:
         assert run["inputs"][str(rig)] == hashlib.sha256(rig.read_bytes()).hexdigest()
         json.dumps(run)
 
-    def test_hashes_tell_changed_masks(self, tmp_path: Path) -> None:
-        plant = write_scene(tmp_path / "plant")
-        masks = plant / "masks"
-        first, again = (run_scene(plant, masks, IDS_ONLY) for _ in range(2))
-        assert first.inputs == again.inputs
-        path = masks / "001.png"
-        path.write_bytes(path.read_bytes() + b"\0")
-        assert run_scene(plant, masks, IDS_ONLY).inputs[str(masks)] != first.inputs[str(masks)]
-
     def test_weights_of_the_user_are_found_from_any_folder(
         self, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -1,4 +1,5 @@
-"""Every public name: what it gives back is where its inputs were, or on the CPU where its docstring says so."""
+"""Every public name: what it gives back is where its inputs were, or on the CPU where its docstring says so.
+Nothing is asked of a device that a GPU would refuse."""
 
 from __future__ import annotations
 
@@ -15,19 +16,25 @@ import torch
 import mvseg
 from mvseg import (
     Cameras,
+    EpipolarAssignment,
     LeafSurface,
     Masks,
+    MatchConfig,
     Matching,
     MatchReport,
     Origin,
+    ReconstructConfig,
     Regions,
     Scene,
     check_scene,
     cluster_affinity,
+    cluster_aware_nms,
+    epipolar_map,
     fit_surfaces,
     match_regions,
     matching_metrics,
     measure_plant,
+    reconstruct_instances,
     region_affinity,
     shape_distance,
 )
@@ -44,11 +51,9 @@ from synthetic import ball_scene
 SCENE = ball_scene(2, 4, seed=1)
 IDS = SCENE.regions.labels
 CPU = torch.device("cpu")
+COARSE, XY = ReconstructConfig(voxel_budget=2_000), torch.tensor([[0.5, 0.5], [100.5, 80.5], [90.5, 95.5]])
 # Names whose answers are tried on another device in other files, and names that take and give no tensors.
-ELSEWHERE = {
-    "EpipolarAssignment", "cluster_aware_nms", "epipolar_map", "reconstruct_instances",
-    "region_affinity", "MultiViewMaskRCNN", "Regions", "Cameras",
-}  # fmt: skip
+ELSEWHERE = {"MultiViewMaskRCNN", "Cameras"}
 WITHOUT_TENSORS = {
     "__version__", "InputError", "InputWarning", "MatchConfig", "DetectConfig", "TraitsConfig", "ReconstructConfig",
     "RunConfig", "Check", "Finding", "Corrections", "load_corrections", "LeafLink", "Tracks", "track_leaves",
@@ -90,6 +95,16 @@ def grey_photos(cameras: Cameras) -> Callable[[int], np.ndarray]:
 
 Step = Callable[[Regions, Cameras, torch.Tensor], Any]
 STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the device
+    "region_affinity": (lambda r, c, i: region_affinity(r, c).to_dense(), True),
+    "random points": (lambda r, c, i: region_affinity(r, c, num_points=50, seed=0).to_dense(), True),
+    "nview": (lambda r, c, i: match_regions(r, c).match_scores, True),
+    "one-per-view": (lambda r, c, i: match_regions(r, c, MatchConfig(method="one-per-view")).instance_ids, True),
+    "symnmf": (lambda r, c, i: match_regions(r, c, MatchConfig(method="symnmf")).instance_ids, True),
+    "epipolar_map": (lambda r, c, i: epipolar_map(r, c, view=1, xy=XY.to(r.device)), True),
+    "EpipolarAssignment": (lambda r, c, i: torch.stack([*EpipolarAssignment()(r, r, i, cameras=c)]), True),
+    "cluster_aware_nms": (lambda r, c, i: cluster_aware_nms(r.boxes.float(), r.areas.float(), i), True),
+    "reconstruct_instances": (lambda r, c, i: reconstruct_instances(r, i, c, config=COARSE)[1].votes, True),
+    "Regions": (lambda r, c, i: r.label_map(0, i, c.sizes[0].tolist()), True),
     "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 3)], [(0, 1)])).instance_ids, True),
     "match_masks": (lambda r, c, i: match_masks(masks_of(r, i), c, links=Links.of()).match_scores, True),
     "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
@@ -131,10 +146,24 @@ def test_the_answer_is_the_same_there(name: str) -> None:
 
 def test_every_public_name_is_looked_at() -> None:
     inner = {"match_masks", "choose_leaves", "snap_masks", "list_mask_questions"}  # of stages, not public
+    inner |= {"random points", "nview", "one-per-view", "symnmf"}
     assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
 
 
-def test_masks_keep_what_they_know() -> None:
+def test_the_other_device_refuses_what_a_gpu_refuses() -> None:
+    here = torch.arange(6.0).reshape(2, 3)
     with other_device() as device:
-        masks = masks_of(SCENE.regions.to(device), IDS.to(device))
-        assert replace(masks).to("cpu").instance_ids.tolist() == IDS.tolist()
+        there = here.to(device)
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            there + here
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            there[[0, 1]] = here
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            here[there[0].long()]
+        with pytest.raises(TypeError, match="to NumPy"):
+            there.numpy()
+        there[torch.tensor([1])] += 1
+        assert (there + 1).device == device
+        assert there.tolist() == [[0, 1, 2], [4, 5, 6]]
+        assert torch.zeros_like(there).cpu().device == here.device
+        assert torch.tensor([1.5], device=device).item() == 1.5

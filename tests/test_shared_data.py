@@ -92,24 +92,17 @@ def test_fern_loads_projects_and_is_undistorted(shared_data: Path) -> None:
     points = torch.tensor(np.array([point.xyz for point in model.points3D.values()]))
     px, _ = scene.cameras.project(points)
     by_name = {image.name: image for image in model.images.values()}
+    order = {number: row for row, number in enumerate(model.points3D)}
+
+    def in_photo(index: int, px: torch.Tensor) -> np.ndarray:
+        rays = np.concatenate([px.numpy(), np.ones((len(px), 1))], 1) @ np.linalg.inv(scene.cameras.K[index].numpy()).T
+        return np.asarray(scene.views[index].lens.img_from_cam(rays))
+
     for index in (0, 13):
-        view = scene.views[index]
-        assert view.lens is not None
-        image = by_name[view.path.name]
-        seen = [p for p in image.points2D if p.has_point3D()]
-        order = {number: row for row, number in enumerate(model.points3D)}
-        rows = [order[p.point3D_id] for p in seen]
-        rays = np.concatenate([px[index][rows].numpy(), np.ones((len(rows), 1))], 1)
-        rays = rays @ np.linalg.inv(scene.cameras.K[index].numpy()).T
-        in_photo = np.asarray(view.lens.img_from_cam(rays))
-        error = np.linalg.norm(in_photo - np.array([p.xy for p in seen]), axis=1)
-        assert np.median(error) < 1.0
-        photo = read_photo(scene, index)
-        assert photo.shape == (529, 706, 3)
-    moved = np.abs(px[0].numpy() - np.asarray(scene.views[0].lens.img_from_cam(_rays(scene, px[0])))).max(1)
+        seen = [p for p in by_name[scene.views[index].path.name].points2D if p.has_point3D()]
+        shown = in_photo(index, px[index][[order[p.point3D_id] for p in seen]])
+        assert np.median(np.linalg.norm(shown - np.array([p.xy for p in seen]), axis=1)) < 1.0
+        assert read_photo(scene, index).shape == (529, 706, 3)
+    moved = np.abs(px[0].numpy() - in_photo(0, px[0])).max(1)
     inside = ((px[0] > 0) & (px[0] < torch.tensor([706, 529]))).all(1).numpy()
     assert 0.5 < moved[inside].max() < 10  # the lens bends by up to some pixels
-
-
-def _rays(scene, px: torch.Tensor) -> np.ndarray:
-    return np.concatenate([px.numpy(), np.ones((len(px), 1))], 1) @ np.linalg.inv(scene.cameras.K[0].numpy()).T

@@ -22,30 +22,19 @@ from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_co
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.result import Result
 from mvseg.runs import check_target
-from mvseg.scene import Cameras
 from photographed_page import MIDDLE, aim_cameras, write_photos
 
-SIZE, FOCAL = (960, 720), 750.0
 
-
-def small_cameras(num_views: int = 6) -> Cameras:
-    return aim_cameras(num_views, size=SIZE, focal=FOCAL, seed=4)
-
-
-@pytest.fixture(scope="module")
-def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def photograph(folder: Path, num_views: int) -> Path:
     """Photos of the page, printed at 97 %, with the true cameras and a lens."""
-    folder = tmp_path_factory.mktemp("target") / "page"
-    write_photos(folder, small_cameras(), px_per_mm=4, seed=4, printed=0.97, lens=(0.03, -0.01))
+    cameras = aim_cameras(num_views, size=(960, 720), focal=750.0, seed=4)
+    write_photos(folder, cameras, px_per_mm=4, seed=4, printed=0.97, lens=(0.03, -0.01))
     return folder
 
 
 @pytest.fixture(scope="module")
 def two_photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first two alone."""
-    folder = tmp_path_factory.mktemp("target") / "page"
-    write_photos(folder, small_cameras(2), px_per_mm=4, seed=4, printed=0.97, lens=(0.03, -0.01))
-    return folder
+    return photograph(tmp_path_factory.mktemp("target") / "page", 2)
 
 
 def complaint(capsys: pytest.CaptureFixture[str]) -> str:
@@ -124,7 +113,7 @@ def test_masks_end_where_half_of_the_light_is_ink(
 
 @pytest.mark.slow
 def test_a_page_printed_at_97_percent_is_noticed(
-    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Law: measured with the bar as printed, the areas are right."""
     results: list[Result] = []
@@ -134,7 +123,7 @@ def test_a_page_printed_at_97_percent_is_noticed(
         return results[0]
 
     monkeypatch.setattr(check_target, "run_scene", run_once)
-    out = tmp_path / "out"
+    photos, out = photograph(tmp_path / "page", 6), tmp_path / "out"
     assert main(["check", str(photos), "--target", "--quiet", "--out", str(out)]) == 1
     assert "lengths are 3.0% too short: the page was not printed at 100 %" in capsys.readouterr().out
     wrong = json.loads((out / "target.json").read_text())

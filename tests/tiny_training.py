@@ -1,12 +1,11 @@
-"""A tiny data set and a tiny Mask R-CNN for the training tests; as a script, runs that are killed or that share steps.
+"""A tiny data set and a tiny Mask R-CNN for the training tests; as a script, two processes that share steps.
 
-The script imports everything once and forks a process per run: imports take longer than the runs.
+The script imports everything once and forks: imports take longer than the runs.
 """
 
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import sys
 import traceback
@@ -14,7 +13,6 @@ from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import cv2
 import jsonargparse
@@ -28,11 +26,9 @@ from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHe
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.ops import MultiScaleRoIAlign
 
-import mvseg.training.loop
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.training.loop import TrainConfig, train
-from mvseg.training.state import apply_gradients
 
 
 def write_photos(folder: Path, count: int, size: int = 64) -> tuple[Path, Path]:
@@ -134,38 +130,6 @@ def parse_config(path: Path) -> TrainConfig:
     return TrainConfig(**vars(parser.parse_path(path)))
 
 
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def die_at(what: str, number: int) -> None:
-    """Arrange for SIGKILL in a step, checkpoint (half written) or evaluation with this number; they count from 1."""
-    calls = 0
-
-    def is_due() -> bool:
-        nonlocal calls
-        calls += 1
-        return calls == number
-
-    if what == "step":
-        step = lambda *args: die() if is_due() else apply_gradients(*args)  # noqa: E731
-        patch.object(mvseg.training.loop, "apply_gradients", step).start()
-    elif what == "checkpoint":
-        save = torch.save
-
-        def write_half(content: Any, path: Path) -> None:
-            save(content, path)
-            if is_due():
-                path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-                die()
-
-        patch.object(torch, "save", write_half).start()
-    else:
-        evaluate = mvseg.training.loop.detect_and_label
-        detect = lambda *args: die() if is_due() else evaluate(*args)  # noqa: E731
-        patch.object(mvseg.training.loop, "detect_and_label", detect).start()
-
-
 def load_weights(path: Path) -> dict[str, Tensor]:
     return load_file(path)
 
@@ -181,19 +145,6 @@ def fork(run: Callable[[], None]) -> int:
         traceback.print_exc()
         os._exit(1)
     os._exit(0)
-
-
-def is_killed(run: Callable[[], None]) -> bool:
-    """Whether a process that does `run` ends by SIGKILL."""
-    _, status = os.waitpid(fork(run), 0)
-    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
-
-
-def train_until(moment: str, folder: Path, output: Path) -> None:
-    """Resume the run until a moment like "step 4, 2 workers"."""
-    what, number, num_workers, _ = moment.replace(",", "").split()
-    die_at(what, int(number))
-    train(make_config(folder, output, resume=True, num_workers=int(num_workers)), build_tiny())
 
 
 def train_as(rank: int, port: int, config: TrainConfig) -> None:
@@ -213,7 +164,4 @@ def train_together(folder: Path, output: Path) -> bool:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)  # as in the tests (conftest.py): bits are compared
-    data, out, *moments = sys.argv[1:]
-    if moments:
-        sys.exit(not all(is_killed(lambda m=m: train_until(m, Path(data), Path(out))) for m in moments))
-    sys.exit(not train_together(Path(data), Path(out)))
+    sys.exit(not train_together(*map(Path, sys.argv[1:])))

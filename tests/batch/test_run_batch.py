@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from batch_work import run_here
-from mvseg.batch import run_batch as batch
 from mvseg.batch import workers
 from mvseg.batch.run_batch import BatchCounts, run_batch
 from mvseg.batch.status import read_status, scene_state
@@ -26,7 +25,6 @@ from mvseg.cli import main
 from mvseg.cli.command import build_parser
 from mvseg.cli.options import build_run
 from mvseg.config import RunConfig
-from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.results.read import read_instances
@@ -257,14 +255,6 @@ def test_the_options_are_those_of_infer(tmp_path: Path) -> None:
     assert (both.match.seed, both.unit, both.scale, both.up) == (4, "cm", 2, (0, 0, 1))
     names, usual = [field.name for field in fields(RunConfig)], RunConfig()
     assert [name for name in names if getattr(both, name) == getattr(usual, name)] == []
-
-
-def test_weights_are_found_from_wherever_a_worker_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("mine.safetensors").touch()
-    found = batch._find_weights(RunConfig(detect=DetectConfig(weights="mine.safetensors")))
-    assert found.detect.weights == str(tmp_path / "mine.safetensors")
-    assert batch._find_weights(RunConfig()) == RunConfig()
 
 
 def test_an_out_that_is_no_batch_is_left_alone(plants: Path, tmp_path: Path) -> None:

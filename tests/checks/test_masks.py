@@ -7,8 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mvseg.checks.masks import mask_findings, touches_border, without_small_components
-from mvseg.checks.numbers import IMAGES
+from mvseg.checks.masks import mask_findings, touches_border
 from mvseg.regions import regions_from_label_maps
 from synthetic import BallScene, ball_scene
 
@@ -77,14 +76,3 @@ def test_the_border_is_the_last_pixel(scene: BallScene) -> None:
     maps = [labels, *(np.zeros_like(labels) for _ in range(4))]
     regions = regions_from_label_maps(maps)
     assert touches_border(regions, scene.cameras).tolist() == [True, True, True, False]
-
-
-def test_specks_do_not_end_a_mask() -> None:
-    mask = np.zeros((60, 80), bool)
-    mask[20:50, 10:60] = True
-    assert np.array_equal(without_small_components(mask).astype(bool), mask)
-    dirty = mask.copy()
-    dirty[2, 70] = True
-    assert IMAGES.small_component * mask.sum() > 1
-    assert np.array_equal(without_small_components(dirty).astype(bool), mask)
-    assert without_small_components(np.ones((1, 1), bool)).tolist() == [[1]]

@@ -64,14 +64,6 @@ def link(op: str, *places: tuple[str, float, float]) -> dict[str, Any]:
     return {"op": op, "at": [list(place) for place in places]}
 
 
-def test_no_edits_leave_the_masks() -> None:
-    corrected = correct()
-    assert torch.equal(corrected.masks.regions.boxes, MASKS.regions.boxes)
-    assert torch.equal(corrected.masks.regions.crops, MASKS.regions.crops)
-    assert torch.equal(corrected.masks.detection_scores, MASKS.detection_scores)
-    assert len(corrected.links) == 0
-
-
 def test_an_outline_replaces_what_it_covers_by_more_than_half() -> None:
     corrected = correct(square(9, 9, 35, 21))  # all of the left mask, half of the right one, which loses that half
     boxes = corrected.masks.regions.boxes[corrected.masks.view_index == 0].tolist()

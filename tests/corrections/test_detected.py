@@ -163,15 +163,6 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
         np.testing.assert_array_equal(np.where((one == 1) & (view == 4), 0, one), other)
 
 
-def test_what_is_known_without_a_person_is_found_once() -> None:
-    plant = find_in_photos(open_photos(SCENE))
-    assert len(plant.instances.probabilities) == 3
-    assert [len(each) for each in plant.matched] == [int((IDS != WEAK).sum()), len(IDS)]
-    once, twice = (apply_edits(plant, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))
-    assert torch.equal(once.masks.instance_ids, twice.masks.instance_ids)
-    assert len(plant.instances.probabilities) == 3
-
-
 def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     edit = Reject(view="v0", at=at(1, 0), everywhere=True)
     expected, plant, used = run(edit), run(), []

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,10 +9,9 @@ import torch
 from blade_scene import as_regions
 from known_leaves import flat_leaf
 from mvseg.corrections.corrected import Corrected
-from mvseg.corrections.linked_halves import fits_as_well, link_halves
+from mvseg.corrections.linked_halves import link_halves
 from mvseg.masks import Masks
 from mvseg.matching.links import Links
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from three_leaves import CAMERAS, LEAVES, halved_maps, true_maps
 
 ALL = tuple(range(len(CAMERAS)))
@@ -67,17 +63,3 @@ def test_what_a_person_keeps_apart_stays_apart() -> None:
     apart = tuple(int((here & (ids == each)).nonzero()) for each in (1, 11))
     linked = link(maps, (1, 11), (0, 0), cannot=[apart])
     assert len(linked.links.must) == 1
-
-
-@pytest.mark.parametrize(
-    ("iou", "residual_px", "expected"), [(0.8, 1.5, True), (0.78, 1.5, False), (0.9, 1.7, False), (0.9, 1.6, True)]
-)
-def test_a_larger_surface_must_lie_as_near_to_the_outlines(iou: float, residual_px: float, expected: bool) -> None:
-    """Two leaves of IoU 0.8 and 0.85 whose outlines are 1.5 and 1 px off."""
-
-    def fitted(iou: float, residual_px: float) -> LeafSurface:
-        residuals = torch.tensor([math.nan] + [residual_px] * 5, dtype=torch.float64)  # no edge in one view
-        return replace(LEAVES[1], iou=torch.full((6,), iou, dtype=torch.float64), residual_px=residuals)
-
-    assert fits_as_well(fitted(iou, residual_px), [fitted(0.8, 1.5), fitted(0.85, 1.0)]) == expected
-    assert not fits_as_well(fitted(0.65, 1.0), [fitted(0.6, 1.5), fitted(0.85, 1.0)])  # no blade

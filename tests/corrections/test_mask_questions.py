@@ -11,7 +11,7 @@ import torch
 
 from blade_scene import as_regions
 from known_leaves import make_surface
-from mvseg.corrections.mask_questions import MaskQuestion, best_mask, list_mask_questions
+from mvseg.corrections.mask_questions import MaskQuestion, list_mask_questions
 from mvseg.corrections.numbers import QUESTIONS
 from mvseg.masks import Masks, Origin
 from mvseg.verification.choose import RejectedCandidate
@@ -126,17 +126,6 @@ def test_no_masks_and_no_surfaces_are_no_doubts() -> None:
     assert {each.kind for each in list_mask_questions(masks_of(TRUE), {}, cameras=CAMERAS)} == set()
 
 
-def test_the_best_mask_is_the_largest_of_the_sure_ones() -> None:
-    masks = masks_of(TRUE)
-    rows = (masks.instance_ids == 1).nonzero()[:, 0]
-    largest = int(rows[masks.regions.areas[rows].argmax()])
-    assert best_mask(masks, 1, but=-1) == largest
-    assert masks.view_index[best_mask(masks, 1, but=int(masks.view_index[largest]))] != masks.view_index[largest]
-    masks.match_scores[largest] = 0.5
-    assert best_mask(masks, 1, but=-1) != largest
-    assert best_mask(masks, 7, but=-1) == -1
-
-
 def leave_out(leaf: int, chance: float, *views: int) -> RejectedCandidate:
     """The true masks of a leaf in some views, as a candidate that was not chosen."""
     masks = masks_of(TRUE)
@@ -165,14 +154,6 @@ def test_unlikely_candidates_those_of_one_view_and_those_that_have_masks_are_not
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
     left = leave_out(2, 0.09, 0, 2, 4), leave_out(2, 0.5, 3), leave_out(1, 0.5, 0, 1, 2)
     assert list_mask_questions(without(2), surfaces, cameras=CAMERAS, rejected=left) == []
-
-
-def test_what_is_likelier_and_larger_is_asked_first() -> None:
-    nothing = masks_of([np.where(labels == 1, labels, 0) for labels in TRUE])
-    left = leave_out(3, 0.2, 0, 1), leave_out(2, 0.4, 0, 1)
-    found = [each for each in list_mask_questions(nothing, None, cameras=CAMERAS, rejected=left) if each.kind == "leaf"]
-    assert [each.doubt for each in found] == sorted((each.doubt for each in found), reverse=True)
-    assert len(found) == 2
 
 
 GREEN, BROWN = (60, 160, 40), (120, 80, 40)

@@ -15,10 +15,8 @@ from mvseg.detectors.efficientnet_lite import (
     LEVELS,
     LITE_SCALES,
     DepthwiseConv2d,
-    SameConv2d,
     build_lite,
     load_lite,
-    round_channels,
 )
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
@@ -59,18 +57,6 @@ def test_it_is_the_network_of_timm(arch: str) -> None:
         assert [features.shape[1] for features in ours.values()] == channels
         for features, same in zip(ours.values(), expected, strict=True):
             torch.testing.assert_close(features, same, rtol=1e-5, atol=1e-6)
-
-
-def test_padding_is_that_of_tensorflow() -> None:
-    conv = SameConv2d(1, 1, 3, stride=2, bias=False)
-    nn.init.ones_(conv.weight)
-    photo = torch.arange(16.0).reshape(1, 1, 4, 4)
-    assert conv(photo)[0, 0].tolist() == [[45.0, 39.0], [66.0, 50.0]]  # from the corner on; the last ones are cut
-    assert conv(photo[..., :3])[0, 0].shape == (2, 2)
-
-
-def test_channels_are_multiples_of_eight_and_hardly_fewer() -> None:
-    assert [round_channels(number) for number in (17.6, 26.4, 44.0, 352.0, 3.0, 11.0)] == [16, 24, 48, 352, 8, 16]
 
 
 def test_depthwise_filters_stay_in_single_precision() -> None:

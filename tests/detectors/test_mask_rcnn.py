@@ -18,8 +18,6 @@ from torchvision.ops import FrozenBatchNorm2d
 from mvseg.detectors.mask_rcnn import (
     build_bare,
     build_detector,
-    freeze_norm,
-    make_group_norm,
 )
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
@@ -80,22 +78,6 @@ def test_seed_decides_random_weights() -> None:
         torch.manual_seed(4)
         states.append(build_detector("mobilenet_v3_large_fpn", 2).state_dict())
     assert all(torch.equal(value, states[1][key]) for key, value in states[0].items())
-
-
-@pytest.mark.parametrize(("channels", "groups"), [(64, 4), (24, 3), (16, 1), (960, 60)])
-def test_groups_have_sixteen_channels_where_possible(channels: int, groups: int) -> None:
-    assert make_group_norm(channels).num_groups == groups
-
-
-@pytest.mark.parametrize("kind", [nn.BatchNorm2d, FrozenBatchNorm2d])
-def test_frozen_norm_computes_what_the_norm_did(kind: Any) -> None:
-    norm = kind(4, eps=0.01).eval()
-    state = {key: torch.rand_like(value) for key, value in norm.state_dict().items() if value.ndim}
-    norm.load_state_dict(state, strict=False)
-    x = torch.rand(2, 4, 5, 5)
-    frozen = freeze_norm(norm)
-    torch.testing.assert_close(frozen(x), norm(x))
-    assert frozen.eps == 0
 
 
 def test_stock_architecture_from_nothing_downloads_nothing(download: list[Download]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from torchvision.models.detection.roi_heads import maskrcnn_inference, paste_masks_in_image
+from torchvision.models.detection.roi_heads import maskrcnn_inference
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from mvseg.detectors.mask_cut import decide_masks
@@ -54,15 +54,6 @@ def test_masks_are_decided_and_boxes_stay_in_the_frame_of_the_transform(model: t
 
 
 @torch.no_grad()
-def test_masks_come_one_at_a_time_and_are_those_of_torchvision(model: torch.nn.Module, photo: Tensor) -> None:
-    crops = run_heads(model, photo)["masks"]
-    found, masks = detect(model, photo)
-    expected = paste_masks_in_image(crops, found["boxes"], (HEIGHT, WIDTH))[:, 0]
-    for mask, whole in zip(masks, expected, strict=True):
-        assert torch.equal(mask, whole)
-
-
-@torch.no_grad()
 def test_other_thresholds_for_one_call_only(model: torch.nn.Module, photo: Tensor) -> None:
     heads = model.roi_heads
     heads.nms_thresh = 0.2
@@ -97,19 +88,6 @@ def test_the_mask_head_looks_again_in_boxes_that_grow(model: torch.nn.Module, ph
     pooled = heads.mask_roi_pool(features, [grown], resized.image_sizes)
     masks = maskrcnn_inference(heads.mask_predictor(heads.mask_head(pooled)), [plain["labels"]])[0]
     torch.testing.assert_close(found["masks"], decide_masks({"masks": masks, "scores": plain["scores"]})["masks"])
-
-
-@torch.no_grad()
-def test_under_autocast_only_the_backbone_is_in_half_precision(model: torch.nn.Module, photo: Tensor) -> None:
-    seen = []
-    model.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
-    model.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
-    with torch.autocast("cpu", torch.bfloat16):
-        found = run_heads(model, photo)
-    assert seen == [torch.bfloat16, torch.float32]
-    assert {found[key].dtype for key in ("boxes", "scores", "masks")} == {torch.float32}
-    plain = run_heads(model, photo)
-    torch.testing.assert_close(found["scores"][:3], plain["scores"][:3], rtol=0.05, atol=0)
 
 
 @torch.no_grad()

@@ -144,23 +144,6 @@ def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> No
     assert read_all(write(tmp_path, []), scene) == [[], []]
 
 
-@pytest.mark.parametrize(
-    "form", ["{}.jpg", "./{}.jpg", "images/{}.jpg", "images\\{}.jpg", "{}", "{}.png", "plant/images/{}.jpg"]
-)
-def test_images_are_found_by_name(form: str, scene: Scene, tmp_path: Path) -> None:
-    path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
-    assert [len(view) for view in read_all(path, scene)] == [1, 0]
-
-
-def test_views_in_subfolders(tmp_path: Path) -> None:
-    scene = make_scene("images/left/1.jpg", "images/right/1.jpg")
-    path = write(tmp_path, [{"segmentation": [POLYGON], "image_id": 11}], ("left/1.jpg", "right/1.jpg"))
-    assert [len(view) for view in read_all(path, scene)] == [0, 1]
-    path = write(tmp_path, [], ("1.jpg", "right/1.jpg"))
-    with pytest.raises(InputError, match=r"image 1.jpg could be view 0 \(left/1\) or 1 \(right/1\), expected its path"):
-        read_all(path, scene)
-
-
 def test_masks_of_many_photos_are_never_in_memory_together(tmp_path: Path) -> None:
     scene = make_scene(*[f"images/{view}.jpg" for view in range(8)])
     side, per_view = 1000, 6
@@ -225,16 +208,6 @@ def test_a_file_of_other_photos_says_what_it_holds(scene: Scene, tmp_path: Path)
     message = r"none of its images is a photo of the scene, expected a.jpg, b.jpg, found c.jpg, d.jpg, e.jpg and 2 more"
     with pytest.raises(InputError, match=message):
         read_all(write(tmp_path, [], files), scene)
-
-
-@pytest.mark.parametrize("form", ["lm/day1/{}.jpg", "{}_jpg.rf.0a1b2c.jpg", "D:\\x\\{}.JPG", "{}.PNG", "/x/{}"])
-def test_names_of_other_machines_fit_by_their_base_name(form: str, scene: Scene, tmp_path: Path) -> None:
-    path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
-    if form == "{}.PNG":  # the suffix alone says nothing
-        assert [len(view) for view in read_all(path, scene)] == [1, 0]
-        return
-    with warns_of("base_names"):
-        assert [len(view) for view in read_all(path, scene)] == [1, 0]
 
 
 def test_boxes_without_masks_are_counted(scene: Scene, tmp_path: Path) -> None:

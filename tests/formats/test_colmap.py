@@ -128,15 +128,6 @@ def test_too_long_binary_files_and_absurd_counts_are_named(name: str, small: Pat
             read_colmap(model, tmp_path)
 
 
-def test_unknown_camera_model_in_a_binary_file(small: Path, tmp_path: Path) -> None:
-    model = copy_model(small, tmp_path / "plant")
-    data = bytearray((model / "cameras.bin").read_bytes())
-    data[12:16] = struct.pack("<i", 77)
-    (model / "cameras.bin").write_bytes(data)
-    with pytest.raises(InputError, match=r"cameras\.bin: camera model number 77 is not known"):
-        read_colmap(model, tmp_path)
-
-
 class TestText:
     @pytest.fixture
     def folder(self, small: Path, tmp_path: Path) -> Path:
@@ -179,14 +170,6 @@ class TestText:
         path.write_text(text[: int(share * len(text))])
         with pytest.raises(InputError, match=r"sparse: (cannot be read as a COLMAP model|there are no views)"):
             load_scene(folder)
-
-
-@pytest.mark.parametrize("missing", ["images.bin", "points3D.bin"])
-def test_missing_file_of_a_model(missing: str, small: Path, tmp_path: Path) -> None:
-    model = copy_model(small, tmp_path / "plant")
-    (model / missing).unlink()
-    with pytest.raises(InputError, match=r"sparse: cannot be read as a COLMAP model"):
-        read_colmap(model, tmp_path)
 
 
 def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> None:

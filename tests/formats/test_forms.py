@@ -32,8 +32,6 @@ from mvseg.traits.config import TraitsConfig
 from scene_folders import HEIGHT, WIDTH, write_scene
 from warned import warns_of
 
-MIDDLE = slice(2, -2)
-
 
 @pytest.fixture
 def plant(tmp_path: Path) -> Path:

@@ -29,24 +29,6 @@ def test_corners_of_a_board_lie_where_the_camera_sees_them(view: int) -> None:
     assert abs(np.mean(px - true[0].numpy())) < 0.05  # no half pixel
 
 
-def test_sides_of_markers_have_no_bias() -> None:
-    photo, cameras = grey_room(3)
-    found = find_markers(photo, BOARD.family)
-    assert len(found) == 10
-    layout, misses = BOARD.opencv(), []
-    height = BOARD.rows * BOARD.square
-    for points, number in zip(layout.getObjPoints(), layout.getIds().ravel(), strict=True):
-        world = np.asarray(points, float) * [1, -1, 0] + [0, height, 0] + BOARD_AT
-        true, _ = cameras.project(torch.from_numpy(world))
-        sides, true_sides = (
-            np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in (found[int(number)], true[0].numpy())
-        )
-        assert sides == pytest.approx(true_sides, rel=0.015)
-        misses.append(found[int(number)] - true[0].numpy())
-    assert np.abs(misses).max() < 0.5
-    assert np.abs(np.mean(misses, axis=(0, 1))).max() < 0.1  # no half pixel
-
-
 def as_phone(light: np.ndarray) -> np.ndarray:
     """Values of a phone with a contrasty curve and sharpening."""
     coded = light ** (1 / 2.2)

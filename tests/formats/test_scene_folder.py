@@ -17,7 +17,7 @@ from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.run_lengths import encode_mask
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import IGNORE_LABEL, Regions
-from scene_folders import HEIGHT, WIDTH, K, arc_pose, draw_labels, edit_rig, rig_content, write_image, write_scene
+from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
 
 DISTORTION = [-0.8, 0.3, 0.01, -0.01, 0.0]
 
@@ -132,18 +132,6 @@ def test_masks_of_distorted_photos_are_undistorted(kind: str, tmp_path: Path) ->
     assert min(overlap(raw[view], union(straight, view)) for view in range(4)) < 0.93  # there was something to do
     if kind == "png":
         assert torch.equal(regions.labels, straight.labels)
-
-
-def test_views_in_subfolders_have_masks_in_subfolders(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "plant", images=False)
-    rig = rig_content()
-    for view, name in enumerate(("left/1", "left/2", "right/1", "right/2")):
-        rig["views"][view]["file"] = f"images/{name}.jpg"
-        write_image(folder / "nested" / f"{name}.png", draw_labels(*arc_pose(view, 4)))
-    (folder / "cameras.json").write_text(json.dumps(rig))
-    scene = load_scene(folder)
-    assert [view.name for view in scene.views] == ["left/1", "left/2", "right/1", "right/2"]
-    assert load_masks(scene, folder / "nested").num_per_view.tolist() == [3, 3, 3, 3]
 
 
 def test_missing_masks_are_named(tmp_path: Path) -> None:

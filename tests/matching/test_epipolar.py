@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch.overrides import TorchFunctionMode
 
-from mvseg.detection.assignment import ruzicka_similarity
 from mvseg.errors import InputError
-from mvseg.matching.affinity import region_affinity
 from mvseg.matching.epipolar import (
     Spans,
     choose_bins,
-    dilate,
     epipolar_bands,
     epipolar_map,
     find_spans,
@@ -85,16 +79,6 @@ def _angle(pseudo: torch.Tensor) -> torch.Tensor:
     return torch.atan2(y, x)
 
 
-@pytest.mark.parametrize("name", RIGS)
-def test_angles_grow_with_the_true_angle(name: str) -> None:
-    cameras = rig(name)
-    pencil = epipolar_pencil(cameras, 0, 1)
-    xy = pixels_of_a_grid(cameras, 0).double()
-    x, y = (torch.cat((xy, torch.ones(len(xy), 1).double()), 1) @ pencil.plane_from_px[0].T).unbind(1)
-    by_atan2 = torch.atan2(y, x).argsort(stable=True)
-    assert (pencil.angles(0, xy)[by_atan2].diff() >= 0).all()
-
-
 def test_pitch_is_the_angle_of_one_pixel_across_the_line() -> None:
     cameras = rig("side by side")
     pencil = epipolar_pencil(cameras, 0, 1)
@@ -115,48 +99,6 @@ def test_pencils_of_many_pairs_are_those_of_each_pair() -> None:
     assert epipolar_pencils(cameras, []) == []
 
 
-def test_pitch_is_less_along_the_line() -> None:
-    cameras = cameras_at(arc_positions(4))
-    xy = pixels_of_a_grid(cameras, 0).double()
-    pencils = epipolar_pencils(cameras, [(0, 1), (0, 2), (0, 3)])
-    steps = torch.cat((xy + torch.tensor([0.005, 0]), xy - torch.tensor([0.005, 0])))
-    for pencil in pencils:  # the line's slope is what is missing from one direction
-        along_x = pencil.angles(0, steps).reshape(2, -1).diff(dim=0).abs().mean() / 0.01
-        assert along_x <= pencil.pitch(0, xy) * (1 + 1e-3)
-
-
-def test_every_tensor_is_made_where_the_regions_are() -> None:
-    """What would fail on a GPU shows on the CPU: a tensor that is made without naming its device."""
-    scene = ball_scene(4, 3)
-    ids = scene.regions.labels
-    with DeviceNamed():
-        region_affinity(scene.regions, scene.cameras)
-        ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras, max_pixels=50)
-        scene.regions.spread_pixels(5)
-        with pytest.raises(AssertionError, match="device"):
-            torch.zeros(3)
-
-
-class DeviceNamed(TorchFunctionMode):
-    """Inside, tensors made from nothing must say on which device."""
-
-    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        if func in (torch.zeros, torch.ones, torch.full, torch.empty, torch.arange, torch.tensor, torch.linspace):
-            assert (kwargs or {}).get("device") is not None, f"{func.__name__} without a device"
-        return func(*args, **(kwargs or {}))
-
-
-def test_pencil_does_not_depend_on_the_world() -> None:
-    cameras = rig("side by side")
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
-    rotation = rotation * torch.linalg.det(rotation)
-    other = moved(cameras, 37.0, rotation, torch.tensor([100.0, -5.0, 3.0]).double())
-    xy = pixels_of_a_grid(cameras, 0).double()
-    for side in (0, 1):
-        expected = epipolar_pencil(cameras, 0, 1).angles(side, xy)
-        torch.testing.assert_close(epipolar_pencil(other, 0, 1).angles(side, xy), expected, atol=1e-9, rtol=0)
-
-
 def test_views_that_share_a_centre_have_no_pencil() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
     assert is_coincident(cameras).tolist() == [[True, True, False], [True, True, False], [False, False, True]]
@@ -170,29 +112,6 @@ def test_many_cameras_far_from_the_origin_keep_their_baselines() -> None:
     assert torch.equal(is_coincident(cameras), torch.eye(28, dtype=torch.bool))
 
 
-def test_dilate_agrees_with_a_loop() -> None:
-    occupied = torch.rand(4, 60, generator=torch.Generator().manual_seed(0)) < 0.08
-    for radius in (1, 3, 70):
-        expected = torch.zeros(4, 60)
-        for row, column in occupied.nonzero().tolist():
-            expected[row, max(0, column - radius) : column + radius + 1] = 1
-        assert torch.equal(dilate(occupied, radius), expected)
-
-
-def test_histograms_hold_every_pixel_once() -> None:
-    scene = ball_scene(6, 3)
-    samples, members = view_samples(scene.regions)
-    pencil = epipolar_pencil(scene.cameras, 0, 2)
-    angles = pencil.angles(0, samples[0].xy), pencil.angles(1, samples[2].xy)
-    bins = choose_bins((pencil.pitch(0, samples[0].xy), pencil.pitch(1, samples[2].xy)), angles)
-    for side, view in ((0, 0), (1, 2)):
-        spans = find_spans(pencil, side, samples[view])
-        counts = span_histogram(bins, spans)
-        torch.testing.assert_close(counts.sum(1), scene.regions.areas[members[view]].float())
-        far = spans.low + 10
-        assert span_histogram(bins, dataclasses.replace(spans, low=far, high=far)).sum() == 0
-
-
 def test_histograms_of_very_many_pixels_count_in_wider_numbers() -> None:
     """A mask of 40 megapixels in one bin."""
     weight = torch.full((10,), 4e6)
@@ -200,27 +119,6 @@ def test_histograms_of_very_many_pixels_count_in_wider_numbers() -> None:
     bins = choose_bins((0.01, 0.01), (torch.tensor([0.0, 1.0]),) * 2)
     spans = Spans(angles, angles.clone(), owner, weight, num_pixels=4e7, num_regions=1)
     assert span_histogram(bins, spans).sum() == 4e7
-
-
-@pytest.mark.parametrize("name", RIGS)
-def test_runs_lie_in_the_bins_of_their_pixels(name: str) -> None:
-    scene, cameras = ball_scene(6, 2, seed=3), rig(name)
-    regions = scene.regions
-    runs, pixels = view_runs(regions)[0], view_samples(regions)[0]
-    pencil = epipolar_pencil(cameras, 0, 1)
-    for side in (0, 1):
-        assert len(runs[side].xy) < len(pixels[side].xy) / 3
-        torch.testing.assert_close(runs[side].pixels().xy, pixels[side].xy)
-        angles = pencil.angles(side, pixels[side].xy)
-        bins = choose_bins((pencil.pitch(side, pixels[side].xy),) * 2, (angles, angles))
-        expected = span_histogram(bins, find_spans(pencil, side, pixels[side]))
-        counts = span_histogram(bins, find_spans(pencil, side, runs[side]))
-        torch.testing.assert_close(counts.sum(1), expected.sum(1), rtol=1e-3, atol=0)
-        occupied, shown = dilate(expected, 1), dilate(counts, 1)
-        assert (shown >= occupied).all()
-        assert (shown != occupied).float().mean() < 0.01  # bins that a run crosses between two of its pixels
-        far = (counts.cumsum(1) - expected.cumsum(1)).abs().amax(1) / expected.sum(1)
-        assert far.max() < 0.06  # hardly any pixel is in another bin: balls of a few hundred pixels
 
 
 def test_runs_across_the_jump_and_near_an_epipole_count_as_pixels() -> None:
@@ -284,7 +182,3 @@ def test_a_map_without_members_elsewhere_is_zero() -> None:
     xy = torch.tensor([[10.5, 10.5], [160.5, 120.5]])
     assert epipolar_map(alone, scene.cameras, view=0, xy=xy).tolist() == [0.0, 0.0]
     assert epipolar_map(alone, scene.cameras, view=1, xy=torch.zeros(0, 2)).shape == (0,)
-
-
-def test_an_arc_of_cameras_has_distinct_places() -> None:
-    assert is_coincident(cameras_at(arc_positions(6))).sum() == 6

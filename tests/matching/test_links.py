@@ -50,25 +50,6 @@ def test_links_that_the_views_agree_with_change_nothing(method: str) -> None:
         assert torch.equal(linked.match_scores, free.match_scores)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_links_against_the_views_hold_in_any_order(method: str) -> None:
-    scene = ball_scene(5, 6, seed=2)
-    config = MatchConfig(method=method)  # type: ignore[arg-type]
-    ids = match_regions(scene.regions, scene.cameras, config).instance_ids
-    one, other = ((ids == k).nonzero()[:, 0].tolist() for k in (1, 2))
-    three = (ids == 3).nonzero()[:, 0].tolist()
-    must, cannot = [(one[0], other[1]), (one[0], one[1])], [(three[0], three[2]), (three[1], one[0])]
-    found = [
-        match_regions(scene.regions, scene.cameras, config, links=links).instance_ids
-        for links in (Links.of(must, cannot), Links.of([p[::-1] for p in must[::-1]], [p[::-1] for p in cannot[::-1]]))
-    ]
-    assert torch.equal(*found)
-    for first, second in must:
-        assert found[0][first] == found[0][second] > 0
-    for first, second in cannot:
-        assert found[0][first] != found[0][second] or found[0][first] == -1
-
-
 def clusters_of(graph: ViewGraph, links: Links) -> list[int]:
     found: list[int] = one_per_view_clusters(replace(graph, links=links)).ids.tolist()
     return found

@@ -22,11 +22,7 @@ from mvseg.matching.nview.plane_sweep import (
     EMPTY,
     OUTSIDE,
     PlaneSweep,
-    blocks_of_runs,
-    index_hypotheses,
-    pack_views,
     rays_per_region,
-    run_starts,
     sweep_dilated,
     sweep_planes,
 )
@@ -188,17 +184,6 @@ def test_hypotheses_are_what_points_on_the_ray_show(balls: BallScene, sweep: Pla
         assert is_shown.any()
 
 
-def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, block_size=10))
-    runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
-    runs = np.append(runs, [40] * 35)  # longer than a block
-    blocks = blocks_of_runs(run_starts(runs), len(runs))
-    assert np.concatenate([runs[block] for block in blocks]).tolist() == runs.tolist()
-    assert len(blocks) > 10
-    assert all(runs[block.stop - 1] != runs[block.stop] for block in blocks[:-1])
-    assert blocks_of_runs(np.zeros(0, np.int64), 0) == []
-
-
 def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
     scores: ClusterScores, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -210,27 +195,6 @@ def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
     found = again.own(clusters), again.coverages(clusters), em_affinities(scores.sweep)[-1]
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, atol=1e-5)
-
-
-def test_hypotheses_are_found_by_the_regions_that_they_name(sweep: PlaneSweep) -> None:
-    index = index_hypotheses(sweep.labels, len(sweep.view_index))
-    members = [np.array([0, 9, 17]), np.zeros(0, np.int64)]
-    cluster, hypothesis, views = index.count(members)
-    counts = np.zeros((2, len(sweep.labels)))
-    counts[cluster, hypothesis] = views
-    np.testing.assert_array_equal(counts, [np.isin(sweep.labels, cluster).sum(1) for cluster in members])
-    assert views.min() == 1
-    assert (np.diff(cluster * len(sweep.labels) + hypothesis) > 0).all()
-    assert [len(each) for each in index.count([])] == [0, 0, 0]
-
-
-def test_sets_of_views_are_bits_in_words() -> None:
-    is_view = np.random.default_rng(0).random((7, 130)) < 0.5
-    words = pack_views(is_view)
-    assert words.shape == (3, 7)
-    np.testing.assert_array_equal(np.bitwise_count(words).sum(0), is_view.sum(1))
-    both = words[:, 0] & words[:, 1]
-    assert np.bitwise_count(both).sum() == (is_view[0] & is_view[1]).sum()
 
 
 def test_label_maps_that_grow_step_by_step_give_the_sweep_of_each_step(balls: BallScene) -> None:

@@ -8,13 +8,11 @@ import torch
 
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.numbers import ONE_PER_VIEW
 from mvseg.matching.one_per_view import (
     assign_one_to_one,
     join_alone,
     link_average,
     one_per_view_clusters,
-    power_iteration,
 )
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
@@ -53,12 +51,6 @@ def mean_weights_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.
     for index, cluster in enumerate(clusters):
         ids[cluster] = index
     return ids
-
-
-def test_hand_made_triangle() -> None:
-    """0 and 1 are in one view, 2 in another; 2 prefers 1."""
-    W = np.array([[0, 0, 0.5], [0, 0, 0.6], [0.5, 0.6, 0]])
-    assert ids_of(W, [0, 0, 1]) == [-1, 1, 1]
 
 
 def test_the_whole_view_decides_not_the_single_best_edge() -> None:
@@ -126,14 +118,6 @@ def test_of_two_alone_in_one_view_the_one_with_the_largest_weight_to_anybody_com
     W[0, 1], W[0, 2], W[1, 2], W[0, 3], W[1, 3] = 0.9, 0.6, 0.6, 0.9, 0.5
     joined = join_alone(ViewGraph(W + W.T, views, 3), Clusters.of(np.array([0, 0, 1, 2])), stop=0.4)
     assert joined.ids.tolist() == [0, 0, 1, 0]
-
-
-def test_sweeps_settle() -> None:
-    views = np.random.default_rng(1).integers(0, 4, 30)
-    W = random_weights(views, 1)
-    graph = ViewGraph(W, views, 4)
-    once = power_iteration(graph, link_average(graph, ONE_PER_VIEW.stop))
-    np.testing.assert_array_equal(power_iteration(graph, once).ids, once.ids)
 
 
 def test_balls_are_solved_in_any_order() -> None:

@@ -13,7 +13,7 @@ from mvseg.formats.lens import photo_from_pinhole
 from mvseg.poses import known_world
 from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import WorldFacts
-from mvseg.poses.known_world import marker_sides, place
+from mvseg.poses.known_world import place
 from room_scene import BOARD, BOARD_AT
 from warned import warns_of
 
@@ -165,15 +165,3 @@ def test_nothing_known_leaves_the_scene_as_it_is(room) -> None:
     placement = place(room.scene, WorldFacts())
     np.testing.assert_array_equal(placement.similarity.matrix(), np.eye(4)[:3])
     assert "arbitrary units" in placement.describe()
-
-
-def test_sides_of_squares_anywhere() -> None:
-    """Turned, moved and noisy squares; a marker without its fourth corner says nothing."""
-    rng = np.random.default_rng(0)
-    square = np.array([[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0.0]])
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    corners = {(7, corner): 30 * square[corner] @ turn + 100 for corner in range(4)}
-    corners |= {(9, corner): 50 * square[corner] + 0.01 * rng.normal(size=3) for corner in range(4)}
-    corners |= {(11, corner): square[corner] for corner in range(3)}
-    np.testing.assert_allclose(marker_sides(corners), [30, 50], rtol=1e-3)
-    assert len(marker_sides({})) == 0

@@ -13,7 +13,6 @@ from mvseg.reconstruction.surface.hull import carve_hull, locate_points
 from mvseg.reconstruction.surface.mask_stack import MaskStack, choose_pixel_size, stack_masks
 
 BLADE = EllipticBlade(bend=0.9)
-NOTHING = np.zeros((SIZE, SIZE), np.int32)
 
 
 def stack(num_views: int, *, times: int = 1) -> MaskStack:

@@ -1,16 +1,11 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import torch
 from scipy.ndimage import binary_dilation
 from scipy.spatial.transform import Rotation
 
 from blade_scene import SIZE, as_regions, ring_cameras
-from conftest import true_ids
-from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -34,12 +29,6 @@ def test_axes_turn_and_are_mirrored_as_the_world_is() -> None:
     assert find_axes(turned, turn @ middle, AREAS) == pytest.approx(axes @ turn.T, abs=1e-9)
     order = [4, 0, 1, 2, 3]
     assert find_axes(px_from_world[order], middle, AREAS[order]) == pytest.approx(axes, abs=1e-9)
-
-
-@pytest.mark.parametrize("num_views", [1, 2])
-def test_few_cameras_have_axes_too(num_views: int) -> None:
-    axes = find_axes(some_cameras(num_views), np.zeros(3), AREAS[:num_views])
-    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
 def test_the_middle_is_where_the_rays_meet() -> None:
@@ -89,18 +78,3 @@ def test_areas_do_not_depend_on_how_world_and_photos_are_turned() -> None:
     surfaces = fit_surfaces(*as_regions(maps), cameras)
     turned, cameras = tell_otherwise(maps, cameras)["all three"]
     assert largest_change(surfaces, fit_surfaces(*as_regions(turned), cameras)) < 0.05
-
-
-@pytest.mark.slow
-@pytest.mark.shared_data
-def test_areas_of_a_real_plant_do_not_depend_on_it_either(shared_data: Path) -> None:
-    folder = shared_data / "basil-0729"
-    scene = load_scene(folder)
-    regions = load_masks(scene, folder / "masks")
-    ids, sizes = true_ids(scene, regions, folder / "truth"), scene.cameras.sizes.tolist()
-    maps = [regions.label_map(view, ids.clamp(min=0), size).numpy() for view, size in enumerate(sizes)]
-    surfaces = fit_surfaces(regions, ids, scene.cameras)
-    turned, cameras = tell_otherwise(maps, scene.cameras)["all three"]
-    regions, ids = as_regions(turned)
-    assert torch.equal(ids.unique(), torch.tensor(list(surfaces)))
-    assert largest_change(surfaces, fit_surfaces(regions, ids, cameras)) < 0.5

@@ -36,23 +36,6 @@ def test_centre_lies_within_its_deviations(offsets: list[np.ndarray]) -> None:
     assert np.mean(inside) > 0.75
 
 
-def test_centre_moves_with_the_offsets_and_turns_with_their_sign() -> None:
-    errors = learn_mask_errors(FLAT)
-    assert errors is not None
-    centre, deviation = errors.centre(FLAT[0])
-    assert errors.centre(FLAT[0] + 7) == pytest.approx((centre + 7, deviation), abs=0.03)
-    assert errors.centre(-FLAT[0])[0] == pytest.approx(-centre, abs=0.06)
-    assert errors.centre(FLAT[0][::-1])[0] == pytest.approx(centre)
-
-
-def test_density_is_symmetric_and_sums_to_one() -> None:
-    errors = learn_mask_errors(NORMAL)
-    assert errors is not None
-    assert errors.density == pytest.approx(errors.density[::-1])
-    assert errors.density.sum() * 0.05 == pytest.approx(1, abs=1e-3)
-    assert errors.sd_px == pytest.approx(2, abs=0.3)
-
-
 def test_clean_masks_and_few_masks_teach_nothing() -> None:
     assert learn_mask_errors([0.02 * each for each in NORMAL]) is None
     assert learn_mask_errors([np.arange(ERRORS.least_masks - 1.0)]) is None

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -9,7 +9,7 @@ import pytest
 from benchmarks.faults import disc
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
 from mvseg.reconstruction.numbers import FIT, IMAGE, STACK
-from mvseg.reconstruction.surface.fit_patch import fit_patches, invert_normal, per_view
+from mvseg.reconstruction.surface.fit_patch import fit_patches, invert_normal
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
     MIDRIB,
@@ -20,26 +20,24 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_grid,
     patch_prior,
 )
-from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack, stack_masks
+from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.outline import nearest_samples, outline_distances, outline_samples, search_edges
 from mvseg.reconstruction.surface.patch_image import (
     cover_crops,
     crop_ious,
-    draw_patch,
     draw_polygons,
     fill_grids,
     grid_orientations,
     grid_quads,
-    grow,
     hiding_pixels,
     project_points,
-    view_ious,
 )
 from reference import nearest_edge_reference
 
 CAMERAS = ring_cameras(4)
 GRID = patch_grid(36, 9)
 NOTHING = np.zeros((SIZE, SIZE), np.int32)
+OFFSETS_PX = np.array([-2.0, 2.0, -2.0, 2.0])
 
 
 def matrices() -> Floats:
@@ -129,26 +127,6 @@ def test_where_another_instance_hides_the_leaf_it_need_not_shrink() -> None:
     assert np.abs(np.median(with_rule.px)) < 0.1
 
 
-def test_beyond_the_frame_is_hidden() -> None:
-    mask = np.zeros((SIZE, SIZE), bool)
-    mask[:30, 50:90] = True
-    frame = stack_masks([mask], [NOTHING], [0], px_from_world=matrices()[:1])
-    places = np.array([[70.0, -1.0], [70.0, 40.0]]) - (50 - STACK.margin, 0 - STACK.margin)
-    values = frame.look_up(frame.others, np.zeros(2, int), places)
-    assert values.tolist() == [FRAME, 0]
-
-
-def test_samples_of_an_edge_lie_on_it_and_point_outwards() -> None:
-    masks = stack()
-    ahead = masks.interpolate(masks.blurred, masks.edge_stack, (masks.edge_px + 1.5 * masks.edge_normals)[:, None])
-    behind = masks.interpolate(masks.blurred, masks.edge_stack, (masks.edge_px - 1.5 * masks.edge_normals)[:, None])
-    on = masks.interpolate(masks.blurred, masks.edge_stack, masks.edge_px[:, None])
-    assert np.abs(on - 0.5).max() < 0.05
-    assert (ahead < 0.35).all()
-    assert (behind > 0.65).all()
-    assert np.linalg.norm(masks.edge_normals, axis=1) == pytest.approx(1)
-
-
 def test_outline_has_no_samples_inside_the_patch() -> None:
     """A blade folded in two: the crease is an outline from the side, and its hidden rim is none."""
     folded = ellipse()
@@ -235,22 +213,6 @@ def test_nearest_edges_of_all_samples_at_once_are_those_of_each(reach: float) ->
     assert num_found > 10
 
 
-def test_medians_of_each_view() -> None:
-    """Slow twin: `np.median` of each."""
-    rng = np.random.default_rng(0)
-    stack_index, values = rng.integers(0, 6, 40), rng.normal(size=40)
-    found = per_view(values, np.where(stack_index == 3, 4, stack_index), 6)
-    for view in range(6):
-        here = values[np.where(stack_index == 3, 4, stack_index) == view]
-        assert np.isnan(found[view]) if view == 3 else found[view] == np.median(here)
-
-
-def test_iou_of_a_patch_in_its_place() -> None:
-    masks = stack()
-    assert view_ious(masks, GRID.points(ellipse())).min() > 0.96
-    assert view_ious(masks, GRID.points(ellipse(0.5, 0.45))).max() < 0.65
-
-
 def test_neighbour_behind_the_leaf_hides_nothing() -> None:
     other = NOTHING.copy()
     other[:, SIZE // 2 :] = 7
@@ -289,17 +251,16 @@ def draw_polygons_reference(points: Floats, view: int) -> np.ndarray:
     return (meet[..., 0] / length) ** 2 + (meet[..., 1] / width) ** 2 <= 1
 
 
+def eroded_and_dilated() -> MaskStack:
+    masks = zip(blade_masks(EllipticBlade(), CAMERAS), (cv2.MORPH_ERODE, cv2.MORPH_DILATE) * 2, strict=True)
+    grown = [cv2.morphologyEx(mask.astype(np.uint8), change, disc(2)).astype(bool) for mask, change in masks]
+    return stack_masks(grown, [NOTHING] * 4, range(4), px_from_world=matrices())
+
+
 def test_a_patch_drawn_as_its_masks_are_has_no_distance() -> None:
     """Masks eroded and dilated by 2 px: drawn alike, the true patch explains them; as it is, it does not."""
-    grown = [
-        cv2.morphologyEx(mask.astype(np.uint8), operation, disc(2)).astype(bool)
-        for mask, operation in zip(
-            blade_masks(EllipticBlade(), CAMERAS), (cv2.MORPH_ERODE, cv2.MORPH_DILATE) * 2, strict=True
-        )
-    ]
-    masks = stack_masks(grown, [NOTHING] * 4, range(4), px_from_world=matrices())
-    offsets = np.array([-2.0, 2.0, -2.0, 2.0])
-    alike = outline_distances(masks, GRID, ellipse(), reach=6.0, is_imaged=True, offsets=offsets)
+    masks = eroded_and_dilated()
+    alike = outline_distances(masks, GRID, ellipse(), reach=6.0, is_imaged=True, offsets=OFFSETS_PX)
     as_it_is = outline_distances(masks, GRID, ellipse(), reach=6.0, is_imaged=True)
     assert np.median(np.abs(alike.px)) < 0.3
     assert np.median(np.abs(as_it_is.px)) > 1.5
@@ -307,43 +268,14 @@ def test_a_patch_drawn_as_its_masks_are_has_no_distance() -> None:
 
 def test_masks_made_smaller_by_their_offsets_are_as_large_as_the_patch() -> None:
     """Slow twin: the masks before they were eroded and dilated by 2 px."""
-    true = blade_masks(EllipticBlade(), CAMERAS)
-    operations = (cv2.MORPH_ERODE, cv2.MORPH_DILATE) * 2
-    grown = [
-        cv2.morphologyEx(mask.astype(np.uint8), operation, disc(2)).astype(bool)
-        for mask, operation in zip(true, operations, strict=True)
-    ]
-    masks = stack_masks(grown, [NOTHING] * 4, range(4), px_from_world=matrices())
+    true, masks = blade_masks(EllipticBlade(), CAMERAS), eroded_and_dilated()
     covered = cover_crops(masks, project_points(masks.px_from_world, GRID.points(ellipse()))) > 0
     as_it_is = crop_ious(masks, covered)
-    assert (crop_ious(masks, covered, offsets=np.array([-2.0, 2.0, -2.0, 2.0])) > as_it_is + 0.03).all()
+    assert (crop_ious(masks, covered, offsets=OFFSETS_PX) > as_it_is + 0.03).all()
     assert (crop_ious(masks, covered, offsets=np.zeros(4)) == as_it_is).all()
-    for index, (mask, offset) in enumerate(zip(true, (-2.0, 2.0, -2.0, 2.0), strict=True)):
+    for index, (mask, offset) in enumerate(zip(true, OFFSETS_PX, strict=True)):
         shown = masks.depth_px[index] > offset
         assert abs(int(shown.sum()) - int(mask.sum())) < 0.05 * mask.sum()
-
-
-def test_growing_and_shrinking_a_disc_changes_its_radius() -> None:
-    small = cv2.circle(np.zeros((121, 121), np.uint8), (60, 60), 30, 255, -1)
-    radius = np.sqrt((small > 0).sum() / np.pi)
-    for px in (-7.5, -0.6, 0.6, 7.5):
-        assert np.sqrt((grow(small, px) > 0).sum() / np.pi) == pytest.approx(radius + px, abs=0.35)
-
-
-def test_drawing_without_offsets_is_drawing_with_offsets_of_zero() -> None:
-    masks = stack()
-    projection = project_points(masks.px_from_world, GRID.points(ellipse()))
-    assert (draw_patch(masks, projection) == draw_patch(masks, projection, offsets=np.zeros(4))).all()
-
-
-def test_selected_views_are_those_of_a_stack_of_their_own() -> None:
-    mask = blade_masks(EllipticBlade(), CAMERAS)[0]
-    moved = [np.roll(mask, 5 * view, axis=1) for view in range(4)]  # of one size: the margins are the same
-    every = stack_masks(moved, [NOTHING] * 4, range(4), px_from_world=matrices())
-    few = stack_masks(moved[1::2], [NOTHING] * 2, [1, 3], px_from_world=matrices()[1::2])
-    selected = every.select(np.array([False, True, False, True]))
-    for field in fields(MaskStack):
-        assert np.array_equal(getattr(selected, field.name), getattr(few, field.name)), field.name
 
 
 def test_a_patch_that_no_mask_is_near_is_fitted_to_nothing() -> None:

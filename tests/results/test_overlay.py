@@ -114,29 +114,6 @@ def test_unsure_matches_are_marked(regions: Regions) -> None:
     assert (unsure != sure).any()
 
 
-def test_numbers_have_a_white_edge_on_large_photos() -> None:
-    labels = np.ones((900, 1200), np.uint16)
-    photo = np.full((900, 1200, 3), 90, np.uint8)
-    painted = draw_overlay(photo, masks(regions_from_label_maps([labels]), [1]), view=0)
-    is_black, is_white = (painted == 0).all(2), (painted == 255).all(2)
-    around = cv2.dilate(is_black.astype(np.uint8), np.ones((3, 3))) > 0
-    assert is_black.sum() > 30
-    assert is_white.sum() > is_black.sum() / 2
-    tint = (0.45 * 90 + 0.55 * np.array(instance_color(1))).astype(np.uint8)
-    assert not (painted[around] == tint).all(1).any()  # nothing between the number and its edge
-
-
-def test_numbers_are_smaller_on_small_leaves() -> None:
-    labels = np.zeros((900, 1200), np.uint16)
-    labels[100:800, 100:800], labels[300:316, 1000:1016] = 1, 2
-    painted = draw_overlay(
-        np.full((900, 1200, 3), 90, np.uint8), masks(regions_from_label_maps([labels]), [1, 1]), view=0
-    )
-    is_black = (painted == 0).all(2)
-    large, small = is_black[:, :850].any(1).sum(), is_black[:, 850:].any(1).sum()
-    assert 8 <= small < 0.7 * large
-
-
 class TestFindPlant:
     def test_it_is_around_what_is_matched(self) -> None:
         """A plant of a tenth of the width, and a mask elsewhere that is matched to nothing."""

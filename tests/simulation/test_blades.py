@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,8 @@ import pytest
 
 from mvseg.simulation.blades import (
     BLADE_COLUMNS,
-    Arc,
     Blade,
     Leaf,
-    arc_points,
     blade_stations,
     half_widths,
     leaf_from_blade,
@@ -36,19 +33,6 @@ def test_flat_blade_has_the_area_of_its_outline() -> None:
     assert leaf.area == pytest.approx(trapezoids, rel=1e-12)
     assert leaf.length == pytest.approx(70, rel=1e-12)
     assert leaf.width == pytest.approx(40, rel=1e-12)
-
-
-def test_flat_blade_comes_close_to_the_integral_of_its_outline() -> None:
-    a, b = FLAT.outline
-    peak = (a / (a + b)) ** a * (b / (a + b)) ** b
-    beta = math.gamma(a + 1) * math.gamma(b + 1) / math.gamma(a + b + 2)
-    assert make_leaf(FLAT).area == pytest.approx(FLAT.length * FLAT.width * beta / peak, rel=0.01)
-
-
-def test_a_blade_of_constant_width_is_a_rectangle_except_at_its_ends() -> None:
-    blade = Blade(length=50.0, width=10.0, outline=(0.0, 0.0))
-    gap = blade_stations(blade.rows)[1] * 50
-    assert make_leaf(blade).area == pytest.approx(10 * (50 - gap), rel=1e-12)
 
 
 def test_upper_side_of_a_level_blade_faces_up() -> None:
@@ -74,11 +58,6 @@ def test_sizes_scale_with_the_blade() -> None:
     assert two.area == pytest.approx(4 * one.area)
 
 
-def test_sizes_do_not_depend_on_the_direction() -> None:
-    sizes = [(leaf.length, leaf.width, leaf.area) for leaf in (make_leaf(BENT, a) for a in (0.0, 1.0, 4.0))]
-    assert np.allclose(sizes, sizes[0])
-
-
 def test_uv_follows_the_midrib_and_the_edge() -> None:
     leaf = make_leaf(FLAT, azimuth=0.0)
     assert np.allclose(leaf.vertices[:, 0] - 3, 70 * leaf.uv[:, 0])
@@ -93,9 +72,3 @@ def test_lobes_and_teeth_are_peaks_of_the_outline_and_keep_the_width(change: dic
     assert half.min() > 0
     padded = np.pad(half, 1)
     assert ((padded[1:-1] > padded[:-2]) & (padded[1:-1] > padded[2:])).sum() == num_peaks
-
-
-def test_arc_has_the_lengths_of_its_steps() -> None:
-    steps = np.array([1.0, 2.0, 0.5])
-    points = arc_points(np.zeros(3), Arc(azimuth=0.3, elevation=1.0, steps=steps, droop=0.8, sweep=-0.4))
-    assert np.allclose(np.linalg.norm(np.diff(points, axis=0), axis=1), steps)

@@ -73,17 +73,6 @@ def test_finished_scenes_are_skipped_and_missing_ones_made_again(
     assert read_tree(tmp_path / "resumed") == read_tree(tmp_path / "whole")
 
 
-def test_what_a_killed_run_left_unfinished_is_removed(tmp_path: Path) -> None:
-    no_scenes = replace(TINY, plants=())
-    (tmp_path / ".dataset.json.99.partial").touch()  # killed at the very start
-    write_dataset(no_scenes, tmp_path)
-    half_a_photo = tmp_path / "train" / ".ovate-000_leaves-03_views-02.99.partial" / "images" / "000.jpg"
-    half_a_photo.parent.mkdir(parents=True)
-    half_a_photo.write_bytes(b"half")
-    write_dataset(no_scenes, tmp_path)
-    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"dataset.json", "scenes.csv", "train"}
-
-
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
     with pytest.raises(InputError, match="holds files that are not a data set"):

@@ -16,7 +16,6 @@ from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import draw_look
 from mvseg.simulation.pot import Part
 from mvseg.simulation.ray_cast import Rendering, build_stage, render_stage
-from mvseg.simulation.shading import sample_texture
 from rendered import render_view
 
 SIZE = 40
@@ -106,23 +105,6 @@ def test_pixel_centres_decide() -> None:
     assert ids.tolist() == expected.tolist()
 
 
-def test_depth_of_a_level_and_of_a_tilted_plane() -> None:
-    cameras = look_down(300.0)
-    shot = render_view(SimulatedPlant("ovate", (make_level_square(1, 90, 0),), ()), cameras, 0, seed=0)
-    assert shot.depth == pytest.approx(np.full((16, 16), 300.0), rel=1e-6)
-    tilted = make_square(1, [[-90, 90, -45], [-90, -90, -45], [90, -90, 45], [90, 90, 45]])  # z = x / 2
-    shot = render_view(SimulatedPlant("ovate", (tilted,), ()), cameras, 0, seed=0)
-    slope = (np.arange(16) + 0.5 - 8) / 80  # x = slope * depth and depth = 300 - x / 2
-    assert shot.depth == pytest.approx(np.tile(300 / (1 + slope / 2), (16, 1)), rel=1e-6)
-
-
-def test_the_nearer_leaf_hides_the_other_from_both_sides() -> None:
-    plant = SimulatedPlant("ovate", (make_level_square(1, 90, 0.0), make_level_square(2, 90, 5.0)), ())
-    above, below = (render_view(plant, cameras, 0, seed=0) for cameras in (look_down(300.0), look_up(300.0)))
-    assert np.unique(above.ids).tolist() == [2]
-    assert np.unique(below.ids).tolist() == [1]
-
-
 def test_a_ray_that_hits_nothing_is_infinitely_long() -> None:
     stake = Part("stake", np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32))
     away = render_view(SimulatedPlant("ovate", (), (stake,)), look_up(-50.0), 0, seed=0)
@@ -170,9 +152,3 @@ def test_shadow_of_a_leaf_darkens_the_soil() -> None:
     ground = np.where(shot.ids == 0, shot.rgb.mean(-1), np.nan)
     shade = ground[max(int(row) - 12, 0) : int(row) + 12, max(int(column) - 12, 0) : int(column) + 12]
     assert np.nanmin(shade) < 0.8 * np.nanmedian(ground)
-
-
-def test_texture_is_periodic_and_bilinear() -> None:
-    texture = np.arange(16, dtype=np.float32).reshape(4, 4)
-    x, y = np.array([1.0, 5.0, 1.5, 3.5]), np.array([2.0, -2.0, 2.0, 0.0])
-    assert sample_texture(texture, x, y).tolist() == [9.0, 9.0, 9.5, 1.5]

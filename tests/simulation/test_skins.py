@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.simulation.look import Marking, draw_look
+from mvseg.simulation.look import draw_look
 from mvseg.simulation.shading import leaf_color
-from mvseg.simulation.skins import COLUMNS, GAMMA, ROWS, dress, list_skins, unroll_leaf
+from mvseg.simulation.skins import COLUMNS, GAMMA, ROWS, list_skins, unroll_leaf
 
 HEIGHT, WIDTH = 240, 320
 
@@ -53,33 +53,6 @@ def test_leaves_show_their_skin_where_it_lies_on_the_blade() -> None:
     albedo, _, _ = leaf_color(replace(look, skin=skin), np.ones(4, np.uint16), uv, dryness=np.zeros(4, np.float32))
     assert np.allclose(albedo[:, 0], uv[:, 0], atol=1e-5)
     assert np.allclose(albedo[:, 1], (uv[:, 1] + 1) / 2, atol=1e-5)
-
-
-def test_a_marking_colours_what_lies_near_veins_and_nothing_else() -> None:
-    look = replace(draw_look(np.random.default_rng(1), has_parallel_veins=True), leaf_spread=0.0, spots=-100.0)
-    white = np.ones(3, np.float32)
-    marked = replace(look, marking=Marking(color=white, vein=1.0, blotch=0.0, edge=0.0, bias=0.0))
-    v = np.linspace(-1, 1, 41, dtype=np.float32)
-    uv = np.stack([np.full_like(v, 0.01), v], 1)
-    args = (np.ones(41, np.uint16), uv)
-    dry = np.zeros(41, np.float32)
-    plain, _, _ = leaf_color(look, *args, dryness=dry)
-    albedo, _, _ = leaf_color(marked, *args, dryness=dry)
-    assert np.allclose(albedo[20], white, atol=1e-5)  # the midrib
-    changed = np.abs(albedo - plain).max(1)
-    assert changed.min() < 0.01
-    assert (albedo >= plain - 1e-6).all()
-
-
-def test_plants_are_dressed_in_different_ways_and_a_seed_decides() -> None:
-    skins = (unroll_leaf(*tilted_leaf(0.0)),)
-    look = draw_look(np.random.default_rng(1))
-    dressed = [dress(look, skins, np.random.default_rng(seed)) for seed in range(40)]
-    kinds = {(one.skin is not None, one.marking is not None, one.leaf is not look.leaf) for one in dressed}
-    assert kinds == {(False, False, False), (True, False, True), (False, True, False), (False, False, True)}
-    again = dress(look, skins, np.random.default_rng(7))
-    assert np.array_equal(again.leaf, dressed[7].leaf)
-    assert all(one.leaf.min() >= 0 and one.leaf.max() < 1.5 for one in dressed)
 
 
 def test_files_that_are_no_cut_outs_are_named(tmp_path: Path) -> None:

@@ -89,26 +89,6 @@ def test_a_failed_folder_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == [place]
 
 
-@pytest.mark.parametrize("error", [OSError("no"), KeyboardInterrupt()])
-def test_a_folder_that_cannot_be_moved_leaves_the_old_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
-) -> None:
-    place, replace = tmp_path / "out", os.replace
-    with replace_all(place) as folder:
-        (folder / "first").touch()
-
-    def refuse(path: Path, target: Path) -> None:
-        if path.name.endswith(PARTIAL) and (path / "second").exists():
-            raise error
-        replace(path, target)
-
-    monkeypatch.setattr(os, "replace", refuse)
-    with pytest.raises(type(error)), replace_all(place) as folder:
-        (folder / "second").touch()
-    assert [path.name for path in place.iterdir()] == ["first"]
-    assert list(tmp_path.iterdir()) == [place]
-
-
 def left_behind(place: Path, kind: str) -> Path:
     """A folder that a killed run has left beside `place`, with a file in it, and its lock."""
     path = place.with_name(f".{place.name}{kind}")
@@ -193,13 +173,6 @@ def test_a_name_that_no_place_has(tmp_path: Path) -> None:
     for path in (tmp_path / "a\0b", tmp_path / "a\0b" / "out"):
         with pytest.raises(InputError, match=r"'.*a\\x00b.*': cannot be the name of a folder"), folder_whole(path):
             pass
-
-
-def test_links_that_lead_in_a_circle(tmp_path: Path) -> None:
-    (tmp_path / "self").symlink_to("self")
-    for place in (tmp_path / "self", tmp_path / "self" / "out"):
-        with pytest.raises(InputError, match="its links form a loop, expected a folder or a new name"):
-            folder_whole(place).__enter__()
 
 
 def replace_files(place: Path) -> None:

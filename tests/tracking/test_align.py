@@ -11,7 +11,6 @@ from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, guess_chance, list_poses
 from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.numbers import ALIGN
-from mvseg.tracking.place_dates import place_dates
 from tests.plants_over_days import grow_blades, grown, see
 
 BLADES_OF_8 = grow_blades(8, 3)
@@ -64,25 +63,6 @@ def test_another_plant_in_the_pot_is_less_likely_than_the_same_one(seed: int) ->
         (BLADES_OF_8, grown(BLADES_OF_8, 1.05), grow_blades(8, seed))))  # fmt: skip
     same, other = (align(Pair.of(first, each, days=1, knows_up=True))[1] for each in later)
     assert other < ALIGN.told < 0.99 < same
-
-
-def test_one_leaf_in_a_pot_that_stands_still() -> None:
-    """Any turn explains one leaf; that the pot is not turned is likelier."""
-    blades = {3: grow_blades(5, 3)[3]}
-    first, second = leaves_of(see(blades, 0)[0]), leaves_of(see(grown(blades, 1.2), 1)[0])
-    alignment, probability = align(Pair.of(first, second, days=1, knows_up=True))
-    np.testing.assert_allclose(alignment.pose, np.eye(4))
-    assert alignment.pairs.tolist() == [[0, 0]]
-    assert 0.5 < probability < 1
-
-
-def test_a_plant_that_looks_the_same_from_two_sides_may_be_turned_either_way() -> None:
-    half = grow_blades(4, 5)
-    other = {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # the same, turned by half a turn
-    first, second = leaves_of(see(half | other, 0)[0]), leaves_of(see(half | other, 1, turn=30)[0])
-    looked = {(0, 1): list_poses(Pair.of(first, second, days=1, knows_up=True, still=0.0))}
-    _, _, steady = place_dates(2, looked)
-    assert steady[0] < 0.75
 
 
 @pytest.mark.parametrize("pair", [(0, 2), (1, 3)])

@@ -66,10 +66,6 @@ def pairs_of(links: list[Association]) -> list[tuple[tuple[int, int], tuple[int,
     return [(link.before, link.after) for link in links]
 
 
-def test_a_hidden_leaf_is_linked_over_the_gap() -> None:
-    assert pairs_of(link_leaves([1, 0, 1], {(0, 2): np.full((1, 1), -8.0)})) == [((0, 0), (2, 0))]
-
-
 def test_dates_around_outweigh_one_on_which_two_leaves_look_swapped() -> None:
     alike, odd = np.array([[-8.0, 5.0], [5.0, -8.0]]), np.array([[1.0, -1.0], [-1.0, 1.0]])
     costs: Costs = {(0, 1): odd, (1, 2): alike, (0, 2): 2 * alike}

@@ -78,19 +78,6 @@ def test_each_leaf_is_bent_as_the_pairs_of_the_others_say() -> None:
     np.testing.assert_allclose(widths, np.sqrt((3 + 7 * median**2) / 10 * (1 + variances)))
 
 
-def test_few_pairs_hardly_move_the_costs_and_many_that_agree_narrow_them() -> None:
-    pair, there = pair_of(grow_blades(14, 1), grow_blades(14, 1))
-    widths = []
-    for count in (0, 1, 3, 14):
-        bent, width = bend(pair, np.stack([np.arange(count), there[:count]], 1))
-        np.testing.assert_allclose(bent.bases, pair.first.bases, atol=1e-9)
-        widths.append(np.median(width))
-    assert widths[0] == 1
-    assert 0.7 < widths[2] < widths[1] < 1.2
-    assert widths[3] < 0.6
-    np.testing.assert_array_equal(bent_costs(pair, np.zeros((0, 2), int)), fitted_costs(pair, LINKS))
-
-
 def test_a_leaf_of_which_half_is_seen_lies_on_the_whole_one() -> None:
     pair, there = pair_of(grow_blades(7, 2), grow_blades(7, 2))
     half = pair.second.points[:, OBSERVATIONS.cloud // 2 :].repeat(2, axis=1)

@@ -49,14 +49,6 @@ def test_times_with_a_zone_are_in_the_order_in_which_they_were() -> None:
         order_dates([*dates, bare])
 
 
-def test_a_result_that_lost_its_surfaces_is_refused(tmp_path: Path) -> None:
-    write_result(tmp_path / "day", grow_blades(3, 1))
-    assert len(read_date(tmp_path / "day", 0).shaped) == 3
-    (tmp_path / "day" / "surfaces.npz").unlink()
-    with pytest.raises(InputError, match=r"surfaces.npz: is missing, expected the whole result"):
-        read_date(tmp_path / "day", 0)
-
-
 def test_results_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
     for place in ("mon/plant", "fri/plant", "fri/other"):
         write_result(tmp_path / place, grow_blades(3, 1))

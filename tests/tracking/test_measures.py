@@ -34,17 +34,6 @@ def test_idf1(seed: int) -> None:
     assert measure(truth, found)["idf1"] == pytest.approx(best_idf1(truth, found))
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_idf1_is_that_of_trackeval(seed: int) -> None:
-    metrics = pytest.importorskip("trackeval.metrics")
-    truth, found = draw_labels(seed)
-    data = {"num_gt_ids": 4, "num_tracker_ids": 4, "similarity_scores": [np.eye(len(date)) for date in truth]}
-    for name, labels in (("gt", truth), ("tracker", found)):
-        data |= {f"num_{name}_dets": sum(map(len, labels)), f"{name}_ids": [np.array(date) - 1 for date in labels]}
-    evaluated = metrics.Identity({"PRINT_CONFIG": False}).eval_sequence(data)
-    assert measure(truth, found)["idf1"] == pytest.approx(evaluated["IDF1"])
-
-
 def test_tracks_links_births_and_deaths() -> None:
     truth = [[1, 2], [1, 2, 3], [1, 3], [1, 3]]
     assert set(measure(truth, [[7, 8], [7, 8, 9], [7, 9], [7, 9]]).values()) == {1.0}

@@ -14,7 +14,7 @@ from mvseg.errors import InputError
 from mvseg.findings.finding import Finding
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
-from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
+from tests.plants_over_days import Blades, grow_blades, see, true_tracks
 
 BLADES = grow_blades(10, 4)
 
@@ -158,13 +158,6 @@ def test_what_looks_like_a_stem_counts_where_another_date_shows_a_leaf() -> None
     assert [len(date.leaves) for date in tracks.dates] == [3, 4, 4]
     assert all(sum(row.track == track and row.leaf is not None for row in tracks.rows) == 3 - (5 in true)
                for track, true in found.items())  # fmt: skip
-
-
-def test_other_units_are_the_same_plant() -> None:
-    first, _ = see(BLADES, 0)
-    second, _ = see(grown({leaf: blade / 10 for leaf, blade in BLADES.items()}, 1.0), 1, unit="cm")
-    assert track_leaves([first, see({k: b / 10 for k, b in BLADES.items()}, 1, unit="cm", turn=50)[0]]).num_tracks == 10
-    assert second.unit == "cm"
 
 
 def test_what_a_person_says_is_obeyed() -> None:

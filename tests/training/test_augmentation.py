@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.training.augmentation import MEAN_COLOR, AugmentedSamples, augment, make_target, mix_seed, order_epoch
+from mvseg.training.augmentation import MEAN_COLOR, AugmentedSamples, augment, make_target, order_epoch
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
 from tiny_training import write_photos
@@ -150,9 +150,3 @@ def test_epochs_differ() -> None:
     first = order_epoch(20, 4, seed=0, epoch=0)
     assert first != order_epoch(20, 4, seed=0, epoch=1)
     assert first != order_epoch(20, 4, seed=1, epoch=0)
-
-
-def test_seeds_are_well_mixed() -> None:
-    seeds = {mix_seed(*values) for values in np.ndindex(8, 8, 8)}
-    assert len(seeds) == 512
-    assert 0 <= min(seeds) <= max(seeds) < 2**63

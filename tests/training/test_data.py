@@ -18,7 +18,7 @@ from pycocotools import mask as coco_mask
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.training.data import Sample, check_samples, keep_sound, list_samples, read_sample
+from mvseg.training.data import check_samples, keep_sound, list_samples, read_sample
 from warned import warns_of
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
@@ -199,10 +199,6 @@ def test_an_image_without_annotations_is_a_sample(tmp_path: Path) -> None:
     ("annotation", "message"),
     [
         ({"segmentation": "leaf"}, "its segmentation is neither polygons"),
-        ({"segmentation": [[1, 2, 3]]}, "its segmentation is not of the expected polygons"),
-        ({"segmentation": [[1e9, 2, 9, 2, 9, 6]]}, "a polygon reaches far out of the image"),
-        ({"segmentation": compressed(SQUARE) | {"counts": "b1"}}, "do not add up to 16 x 12"),
-        ({"segmentation": compressed(SQUARE[:6])}, "its mask is 16 x 6, expected 16 x 12"),
         ({"segmentation": compressed(SQUARE), "category_id": 5}, "its category 5 is not listed"),
         ({"segmentation": compressed(SQUARE), "category_id": [4]}, r"its category \[4\] is not listed"),
     ],
@@ -223,11 +219,7 @@ def test_broken_annotations(tmp_path: Path, annotation: dict[str, Any], message:
         ({"images": [], "annotations": []}, "lists 0 images"),
         ({"categories": []}, "0 categories"),
         ({"images": [IMAGE | {"file_name": "../b.png"}]}, "image ../b.png: the file name leads out of the folder"),
-        ({"images": [IMAGE | {"file_name": "/b.png"}]}, "image /b.png: the file name leads out of the folder"),
-        ({"images": [IMAGE | {"file_name": 3}]}, r"images\[0\].file_name: Input should be a valid string"),
-        ({"images": [IMAGE | {"height": {}}]}, r"images\[0\].height: Input should be a valid integer"),
         ({"categories": [{"id": 4}]}, r"categories\[0\].name: Field required"),
-        ({"annotations": [{"id": 1, "image_id": []}]}, r"annotations\[0\].image_id"),
         ({"annotations": 3}, "annotations: Input should be a valid list"),
     ],
 )
@@ -306,28 +298,3 @@ def test_folders_that_hold_nothing(tmp_path: Path) -> None:
     write_pair(tmp_path, "a", None, ".jpg")
     with pytest.raises(InputError, match="would share one label image"):
         list_samples(tmp_path / "photos", tmp_path / "labels")
-
-
-@pytest.mark.slow
-@pytest.mark.shared_data
-def test_real_rosettes_are_sound_and_the_same_from_coco(shared_data: Path, tmp_path: Path) -> None:
-    folder = shared_data / "rosettes-cvppp-a1"
-    found = list_samples(folder / "images", folder / "labels")
-    counts, broken = check_samples(found.samples)
-    assert (len(found), broken) == (100, {})
-    assert min(counts) >= 10
-    labelled = read_sample(found.samples[0])
-    height, width = labelled.ignore.shape
-    annotations = [
-        {"id": number, "image_id": 1, "category_id": 1, "segmentation": compressed(mask)}
-        for number, mask in enumerate(masks_of(labelled))
-    ]
-    content = {
-        "images": [{"id": 1, "file_name": found.samples[0].name, "height": height, "width": width}],
-        "categories": [{"id": 1, "name": "leaf"}],
-        "annotations": annotations,
-    }
-    (tmp_path / "coco.json").write_text(json.dumps(content))
-    from_coco: Sample = list_samples(folder / "images", tmp_path / "coco.json").samples[0]
-    assert torch.equal(read_sample(from_coco).layers, labelled.layers)
-    assert torch.equal(read_sample(from_coco).photo, labelled.photo)

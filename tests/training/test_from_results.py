@@ -25,7 +25,6 @@ from mvseg.training.data import list_results, read_sample
 from scene_folders import edit_rig
 from tiny_training import make_config
 
-WIDTH, HEIGHT = 640, 480
 KINDS = (  # instance id, match score, origin
     (1, 0.9, Origin.DETECTED),
     (2, 0.2, Origin.DETECTED),

@@ -24,7 +24,7 @@ import mvseg.training.loop
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
 from mvseg.system.atomic import is_partial
-from mvseg.training.loop import Run, TrainConfig, best_epoch, find_samples, load_chunks, train
+from mvseg.training.loop import Run, TrainConfig, find_samples, load_chunks, train
 from mvseg.training.processes import Processes, join_processes
 from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos
 
@@ -68,7 +68,7 @@ def read_metrics(output: Path) -> dict[str, Any]:
 
 
 def run_script(log: Path, *arguments: str | Path) -> None:
-    """Run tiny_training.py. What it prints goes to a file: workers of a killed run keep a pipe open for seconds."""
+    """Run tiny_training.py; what it prints goes to a file."""
     paths = [str(TESTS.parent), str(TESTS), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, TESTS / "tiny_training.py", *arguments]
@@ -119,11 +119,6 @@ def test_without_validation_the_last_epoch_is_exported(few: Path, tmp_path: Path
     assert "mask_AP" not in read_metrics(tmp_path)["best"]
 
 
-def test_best_epoch() -> None:
-    assert best_epoch([{"mask_AP": 0.1}, {"mask_AP": 0.3}, {"mask_AP": 0.3}]) == 1
-    assert best_epoch([{}, {}]) == 1
-
-
 def test_bf16_on_the_cpu_is_close_to_fp32(leaves: Path, tmp_path: Path, finished: Path) -> None:
     train(make_config(leaves, tmp_path, precision="bf16", epochs=1), build_tiny())
     assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["is_bf16"] is True
@@ -154,23 +149,6 @@ def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: 
         torch.testing.assert_close(load_weights(out / "model.safetensors")[key], value, rtol=1e-4, atol=1e-6)
     for ours, theirs in zip(read_metrics(out)["epochs"], read_metrics(finished)["epochs"], strict=True):
         assert ours == pytest.approx(theirs, rel=1e-4)
-
-
-@pytest.mark.slow
-def test_a_killed_run_ends_with_the_same_bits(leaves: Path, tmp_path: Path, finished: Path) -> None:
-    """SIGKILL between checkpoints, while one is half written, and in an evaluation; with and without workers."""
-    out = tmp_path / "out"
-    run_script(tmp_path / "log", leaves, out, "step 4, 2 workers", "checkpoint 2, 0 workers", "evaluation 1, 1 workers")
-    assert not (out / "metrics.json").exists()
-    train(make_config(leaves, out, resume=True), build_tiny())
-    assert read_log(out) == read_log(finished)
-    assert read_metrics(out) == read_metrics(finished)
-    expected = torch.load(finished / "checkpoint.pt", weights_only=True)
-    ours = torch.load(out / "checkpoint.pt", weights_only=True)
-    for part in ("model", "ema"):
-        assert all(torch.equal(value, expected[part][key]) for key, value in ours[part].items())
-    exported = load_weights(out / "model.safetensors")
-    assert all(torch.equal(exported[key], value) for key, value in load_weights(finished / "model.safetensors").items())
 
 
 def test_resuming_a_finished_run_changes_nothing(few: Path, tmp_path: Path) -> None:

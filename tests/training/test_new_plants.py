@@ -34,17 +34,6 @@ def test_a_seed_gives_one_photo_and_another_seed_another() -> None:
     assert not torch.equal(once.photo, other.photo)
 
 
-def test_new_plants_differ_in_number_and_in_how_large_they_are() -> None:
-    photos = [rendered(seed) for seed in range(4)]
-    counts = [len(photo.classes) for photo in photos]
-    covered = [float((photo.layers > 0).float().mean()) for photo in photos]
-    assert min(counts) <= 6
-    assert max(counts) >= 12
-    assert min(covered) < 0.1
-    assert max(covered) > 0.2
-    assert all(count > 0 for count in counts)  # one leaf is always in sight
-
-
 def test_backgrounds_are_seen_behind_some_plants_and_never_on_a_leaf(backgrounds: tuple[Path, ...]) -> None:
     blue = torch.tensor([0, 0, 255], dtype=torch.uint8)[:, None, None]
     num_seen = 0

@@ -1,8 +1,6 @@
 from __future__ import annotations
 
 import csv
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -138,22 +136,6 @@ def test_pandas_reads_both(tmp_path: Path) -> None:
     long, wide = pandas.read_csv(tmp_path / "long.csv"), pandas.read_csv(tmp_path / "wide.csv")
     assert long["value"].dtype == long["sd"].dtype == wide["area"].dtype == "float64"
     assert wide["leaf"].tolist() == [1, 2]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
-def test_r_reads_both(tmp_path: Path) -> None:
-    """Numbers are numbers, empty cells are NA, and leaves are joined by plant and leaf."""
-    write_long(tmp_path / "long.csv", traits_of())
-    write_wide(tmp_path / "wide.csv", traits_of())
-    code = """
-    long <- read.csv("long.csv"); wide <- read.csv("wide.csv")
-    stopifnot(is.numeric(long$value), is.numeric(long$sd), is.numeric(wide$area), identical(wide$leaf, 1:2))
-    stopifnot(identical(is.na(wide$iou), c(FALSE, TRUE)), identical(wide$quality == "good", c(TRUE, FALSE)))
-    both <- merge(wide, subset(long, trait == "iou"), by = c("plant", "leaf"))
-    stopifnot(nrow(both) == 2, identical(both$iou, both$value), sum(is.na(long$leaf)) > 0)
-    """
-    subprocess.run(["Rscript", "-"], input=code, cwd=tmp_path, text=True, check=True)
 
 
 def test_traits_of_older_versions_are_passed_over(tmp_path: Path) -> None:

@@ -17,12 +17,10 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.candidates import Candidates, Key, gather_candidates
+from mvseg.verification.candidates import Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
-from mvseg.verification.evidence import Evidence, draw_views, median_parallax
-from mvseg.verification.leaf_scores import LEAF_TERMS, TERMS, Met, Pairs, sum_terms
-from mvseg.verification.numbers import EVIDENCE
+from mvseg.verification.evidence import draw_views
 from three_leaves import CAMERAS, LEAVES, true_maps
 from tube_scene import BENT, tube_masks
 from warned import warns_of
@@ -309,27 +307,6 @@ def test_cameras_on_one_side_are_said() -> None:
     assert len(leaves.masks) == len(REGIONS)
 
 
-@pytest.mark.parametrize(("arc_deg", "is_around"), [(26, False), (38, True)])
-def test_surfaces_judge_where_cameras_look_from_enough_sides(arc_deg: float, is_around: bool) -> None:
-    cameras = ring_cameras(2, elevations_deg=(0,), arc_deg=2 * arc_deg)
-    square = np.zeros((SIZE, SIZE), np.int64)
-    square[95:105, 95:105] = 1
-    regions, ids = as_regions([square, square])
-    matched = matched_of(proposals_of(regions, torch.full((2,), 0.8)), ids)
-    assert (median_parallax(matched, cameras) >= EVIDENCE.least_parallax) == is_around
-
-
-@pytest.mark.parametrize(("number", "is_new"), [(15, True), (17, False)])
-def test_nearly_the_same_masks_are_one_candidate(number: int, is_new: bool) -> None:
-    """Twenty masks of one size, of which another matching has some."""
-    square = np.zeros((SIZE, SIZE), np.int64)
-    square[:10, :10] = 1
-    table = proposals_of(as_regions([square] * 20)[0], torch.full((20,), 0.8))
-    found = [matched_of(table, torch.where(torch.arange(20) < n, 1, -1)) for n in (20, number)]
-    candidates = gather_candidates(found, table, None)
-    assert len(candidates) == 1 + is_new
-
-
 @pytest.mark.parametrize("half_widths", [(0.45, 0.4), (0.08, 0.1)])
 def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> None:
     """Unless all leaves are as slender: a strap is no stem."""
@@ -349,38 +326,6 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
     assert (stem[:2] < 0.01).all()
     assert stem[2] > 0.9 if is_stem_told else stem[2] < 0.01
     assert leaves.masks.num_instances == 3 - is_stem_told
-
-
-def test_clear_leaves_are_what_others_are_held_against() -> None:
-    """Of three of which the views show 0.55, 0.75 and 0.85, the last two."""
-    candidates = Candidates((None,) * 3, np.zeros((2, 3)), np.zeros(3), np.zeros(3, np.int64))
-    best, sure = np.array([[0.55, 0.75, 0.85]] * 3), np.array([[0.2, 1.2, 1.6]] * 3)
-    row = np.arange(9).reshape(3, 3)
-    met = Met(candidates, best, row, sure.ravel(), np.ones((3, 3)))
-    clear = met.find_clear(None)
-    assert clear.score == pytest.approx(1.4)
-    np.testing.assert_allclose(LEAF_TERMS["detection score"](met, clear), [-1.2, -0.2, 0.2], atol=1e-12)
-
-
-def test_terms_are_rows_that_add_up() -> None:
-    """In any order; a term that is left out leaves its rows out, and all others as they are."""
-    rng, shape = np.random.default_rng(0), (6, 3)
-    evidence = Evidence(*(rng.random(shape) for _ in range(2)), share=rng.random((2, 3)))
-    matched = np.where(rng.random(shape) < 0.5, rng.random(shape), np.nan)
-    candidates = Candidates((None,) * 3, matched, np.zeros(3), np.zeros(3, np.int64))
-    pairs = Pairs(candidates, evidence, rng.random(6))
-    met = Met(candidates, rng.random((2, 3)), rng.integers(0, 6, (2, 3)), rng.normal(size=6), rng.random((2, 3)))
-    clear = met.find_clear(None)
-    for terms in (
-        {name: term(pairs) for name, term in TERMS.items()},
-        {name: term(met, clear) for name, term in LEAF_TERMS.items()},
-    ):
-        weights = dict(zip(terms, rng.normal(size=len(terms)), strict=True))
-        whole = sum_terms(weights, terms)
-        np.testing.assert_array_equal(whole, sum_terms(dict(reversed(weights.items())), terms))
-        for name, weight in weights.items():
-            others = {other: value for other, value in weights.items() if other != name}
-            np.testing.assert_allclose(whole - sum_terms(others, terms), weight * terms[name], atol=1e-9)
 
 
 def test_nothing_is_an_answer() -> None:

@@ -16,7 +16,7 @@ from mvseg.verification.numbers import EVIDENCE
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 MAPS = true_maps()
-REGIONS, IDS = as_regions(MAPS)
+REGIONS, _ = as_regions(MAPS)
 SURFACES = [LEAVES[1], None, LEAVES[2], LEAVES[3]]
 
 

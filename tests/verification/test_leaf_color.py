@@ -23,16 +23,6 @@ def test_a_missed_leaf_has_the_colour_of_the_others() -> None:
     assert has_leaf_color(photo, colors)[0].tolist() == [True] * 2 + [False] * 16 + [True]
 
 
-def test_counts_of_photos_add_up() -> None:
-    rng = np.random.default_rng(0)
-    photos = rng.integers(0, 256, (2, 6, 5, 3), dtype=np.uint8)
-    is_inside = rng.random((2, 6, 5)) < 0.4
-    parts = [count_colors(photo, inside) for photo, inside in zip(photos, is_inside, strict=True)]
-    whole = count_colors(photos, is_inside)
-    np.testing.assert_array_equal(parts[0] + parts[1], whole)
-    assert whole.sum((1, 2, 3)).tolist() == [is_inside.sum(), (~is_inside).sum()]
-
-
 def test_counts_and_colours_are_those_of_pixels_one_by_one() -> None:
     """Slow twin, on photos with each value of a channel."""
     rng = np.random.default_rng(2)
@@ -45,13 +35,6 @@ def test_counts_and_colours_are_those_of_pixels_one_by_one() -> None:
         expected[(int(not is_inside[row, column]), *place)] += 1
         assert has_leaf_color(photo, colors)[row, column] == colors[place]
     np.testing.assert_array_equal(counts, expected)
-
-
-def test_how_often_photos_are_counted_does_not_matter() -> None:
-    rng = np.random.default_rng(1)
-    photo = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    counts = count_colors(photo, rng.random((8, 8)) < 0.3)
-    np.testing.assert_array_equal(leaf_colors(counts), leaf_colors(counts + counts + counts))
 
 
 def test_nothing_inside_has_no_colour() -> None:

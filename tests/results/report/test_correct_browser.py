@@ -14,14 +14,12 @@ import pycolmap
 import pytest
 import torch
 
-from mvseg.corrections.corrected import Fate
-from mvseg.corrections.file import load_corrections, parse_corrections
+from mvseg.corrections.file import load_corrections
 from mvseg.formats.lens import photo_from_pinhole
-from mvseg.results.report.page import write_report
 from mvseg.results.result import Instances, Result
 from mvseg.verification.choose import RejectedCandidate
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
-from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
+from report_pages import HOSTILE, write_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
@@ -490,21 +488,6 @@ def test_one_key_makes_a_leaf_of_what_was_not_chosen(
     assert (edit["op"], edit["everywhere"]) == ("reject", True)
     assert opened.page.evaluate(asks) == 0
     opened.close()
-
-
-def test_hostile_names_stay_text(browser: sync_api.Browser, balls: Result, tmp_path: Path) -> None:
-    result, path = rename_hostile(balls), tmp_path / "report.html"
-    edits = [{"op": "reject", "view": f"0 {HOSTILE}", "at": [1, 1]}]
-    corrections = parse_corrections({"format": "mvseg-corrections/1", "edits": edits})
-    fates = (Fate(1, "reject", f"bad {HOSTILE}"),)
-    write_report(path, replace(result, corrections=corrections, fates=fates), draw_pictures(result), run=RUN)
-    person = Person(browser, path)
-    assert person.page.locator("#correct-list li button").first.inner_text() == f"no leaf, in 0 {HOSTILE}"
-    assert person.page.locator("#correct-list .doubt").inner_text() == f"bad {HOSTILE}"
-    person.click_mask(0, 1)
-    person.page.keyboard.press("r")
-    assert person.save(tmp_path)[1]["view"] == f"0 {HOSTILE}"
-    person.close()
 
 
 def test_fingers_draw_and_two_of_them_zoom(browser: sync_api.Browser, file: Path) -> None:
