@@ -76,7 +76,7 @@ def test_a_calibrated_camera_stays_and_a_photo_without_texture_is_left_out(room,
     K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL + 1, HEIGHT / 2], [0, 0, 1]])
     calibration = Calibration(K=K, distortion=(), is_fisheye=False, width=None, height=None)
     structure = find_structure(tmp_path, files, config=PoseConfig(), calibration=calibration)
-    assert structure.left_out == structure.plain == ("grey.png",)
+    assert structure.left_out == ("grey.png",)
     assert structure.registered == tuple(names[:4])
     (camera,) = structure.model.cameras.values()
     np.testing.assert_array_equal(camera.calibration_matrix(), K)
