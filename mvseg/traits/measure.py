@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -23,7 +24,7 @@ from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Kind, Rejection, find_rejected, median_iou
 from mvseg.traits.leaf import NEED_UP, Measurement, measure_area, measure_leaf, measure_voxels, missing
-from mvseg.traits.nodes import Stem
+from mvseg.traits.nodes import NODE_COLUMNS, NODE_NUMBERS, Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
 from mvseg.traits.stems import axes_of_masks, find_stems, up_of_stem
@@ -127,6 +128,17 @@ class Traits:
         columns["unit"] = [self.unit or UNKNOWN_UNIT] * len(self.leaves)
         names = "method", "quality", "probability"
         return columns | {name: [getattr(leaf, name) for leaf in self.leaves] for name in names}
+
+    def node_table(self) -> dict[str, list[Any]]:
+        """Columns of nodes.csv with a row per leaf of a stem, by rank, which `pandas.DataFrame` takes."""
+        rows: list[tuple[Any, ...]] = []
+        for stem in self.stems:
+            of_stem = self.unit or UNKNOWN_UNIT, stem.source, stem.probability, *astuple(stem.phyllotaxis)
+            for node in stem.nodes:
+                counted = stem.number, node.number, node.leaves_per_node, node.rank, node.leaf
+                pairs = [(getattr(node, name).value, getattr(node, name).sd) for name in NODE_NUMBERS]
+                rows.append((self.plant, *counted, *chain(*pairs), *node.place, *node.base, *of_stem))
+        return {name: [row[place] for row in rows] for place, name in enumerate(NODE_COLUMNS)}
 
     @property
     def rejected(self) -> dict[int, Kind]:

@@ -21,6 +21,13 @@ START_DEG = np.arange(0.0, 360.0, 4.0)[:, None]  # limit: azimuths of the lowest
 SPIRAL_DEG = np.arange(100.0, 165.0, 2.5)  # definition: divergence angles that count as a spiral
 LEAST_NODES = 4  # limit: leaves that suggest a phyllotaxis
 
+NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "node_azimuth")
+NODE_COLUMNS = (
+    "plant", "stem", "node", "leaves_per_node", "rank", "leaf",
+    *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),
+    "x", "y", "z", "base_x", "base_y", "base_z", "unit", "source", "stem_probability", "phyllotaxis",
+    "phyllotaxis_angle", "phyllotaxis_probability",
+)  # fmt: skip
 VAGUE = missing("not measured: the leaf begins at the stem, and points along it")
 FIRST_NODE = missing("not measured: the lowest node has none below")
 BELOW = missing("not measured: it lies below the end of the stem")

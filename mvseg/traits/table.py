@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from itertools import chain, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 from types import MappingProxyType
 
@@ -15,18 +15,11 @@ from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.traits.filters import Kind
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import GOOD, LeafTraits, Traits, UpFrom
-from mvseg.traits.nodes import Node, Phyllotaxis, Stem
-from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
+from mvseg.traits.nodes import NODE_COLUMNS, NODE_NUMBERS, Node, Phyllotaxis, Stem
+from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
 MOST_BYTES = 1 << 30  # limit: of a table that is read
-NODE_NUMBERS = ("height", "internode", "divergence", "insertion_angle", "node_azimuth")
-NODE_COLUMNS = (
-    "plant", "stem", "node", "leaves_per_node", "rank", "leaf",
-    *(name + end for name in NODE_NUMBERS for end in ("", "_sd")),
-    "x", "y", "z", "base_x", "base_y", "base_z", "unit", "source", "stem_probability", "phyllotaxis",
-    "phyllotaxis_angle", "phyllotaxis_probability",
-)  # fmt: skip
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 
 
@@ -52,19 +45,9 @@ def write_wide(path: Path, traits: Traits) -> None:
 
 
 def write_nodes(path: Path, traits: Traits) -> None:
-    """One row per leaf of a stem, by rank: its node, its numbers with their standard deviations, where the node is and
-    where the blade begins, and how likely the stem and its phyllotaxis are."""
-    rows = []
-    for stem in traits.stems:
-        suggested = stem.phyllotaxis
-        for node in stem.nodes:
-            measured = (getattr(node, name) for name in NODE_NUMBERS)
-            numbers = [*chain.from_iterable((each.value, each.sd) for each in measured), *node.place, *node.base]
-            texts = traits.unit or UNKNOWN_UNIT, stem.source, stem.probability, suggested.name
-            of_stem = suggested.angle, suggested.probability
-            counted = node.number, node.leaves_per_node, node.rank, node.leaf
-            rows.append((traits.plant, stem.number, *counted, *numbers, *texts, *of_stem))
-    write_table(path, NODE_COLUMNS, rows)
+    """One row per leaf of a stem, see `Traits.node_table`."""
+    columns = traits.node_table()
+    write_table(path, list(columns), list(zip(*columns.values(), strict=True)))
 
 
 def read_nodes(path: Path) -> tuple[Stem, ...]:

@@ -258,6 +258,7 @@ def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
     path = tmp_path / "nodes.csv"
     write_nodes(path, Traits("=plant", "mm", (), {}, None, stems))
     text = path.read_text()
+    assert text.splitlines()[0] == ",".join(Traits("p", "mm", (), {}, None, stems).node_table())
     assert text.count("\n") == 9
     assert "\n'=plant,1,1,2,1," in text
     (again,) = read_nodes(path)
