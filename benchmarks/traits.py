@@ -178,7 +178,9 @@ def measure_areas(folder: Path) -> None:
     torch.set_num_threads(1)
     with (folder / "areas.csv").open(encoding="utf-8") as file:
         true = {(row["date"], int(row["leaf"])): float(row["mesh_mm2"]) for row in csv.DictReader(file)}
-    rows = dict[str, list[tuple[float, bool]]]()
+        file.seek(0)
+        meter = {(row["date"], int(row["leaf"])): row["meter_mm2"] for row in csv.DictReader(file)}
+    rows, metered = dict[str, list[tuple[float, bool]]](), list[tuple[float, float]]()
     for date in sorted({date for date, _ in true}):
         scene = load_scene(folder / date)
         regions = regions_from_label_maps(true_maps(folder / date, scene))
@@ -187,12 +189,16 @@ def measure_areas(folder: Path) -> None:
             use = "look" if reasons or not surface.is_credible else "yes"
             form = "occupancy" if surface.occupancy is not None else "whole sheet"
             errors = 100 * abs(error) / true[date, leaf], abs(error) <= 1.96 * surface.deviations[0]
+            metered += [(surface.area, float(meter[date, leaf]))] if meter[date, leaf] else []
             for name in ("all", form, f"use {use}"):
                 rows.setdefault(name, []).append(errors)
     for name, pairs in rows.items():
         percent, inside = np.array(pairs).T
         spread = "{:.1f} / {:.1f} %".format(*np.quantile(percent, (0.5, 0.9)))
         print(f"{name:12}{len(pairs):4} {spread}, {(percent <= 20).mean():.2f} within 20 %, {inside.mean():.2f} inside")
+    ours, theirs = np.array(metered).reshape(-1, 2).T
+    agreement = np.corrcoef(ours, theirs)[0, 1] ** 2, np.median(ours / theirs)
+    print("against a meter: {} leaves, R2 {:.2f}, median ratio {:.2f}".format(len(ours), *agreement))
 
 
 def main() -> None:

@@ -79,14 +79,14 @@ def find_stems(
     if not photos.exist:
         return _of_bases([(each, float(expit(PRIOR))) for each in axes], frame)
     plant = see_plant(surfaces, masks, cameras, photos=photos)
-    chances = [plant.stem_chance(each.axis.points) for each in axes]
+    chances = [plant.axis_chance(each.axis.points) for each in axes]
     likely = [(axis, chance) for axis, (chance, _) in zip(axes, chances, strict=True) if chance > 0.5]
     carried = sum(len(axis.bases) for axis, _ in likely) / len(surfaces)
     if carried >= AXES.near_share:  # else what is left of several axes may stand in free air
         tells_up = len(axes) == 1 and carried >= UP_LEAVES and chances[0][1] >= UP_SEEN
         return _of_bases(likely, frame, tells_up=tells_up)
     path = find_path(plant.cells, plant.leaves)
-    if path is None or (chance := plant.stem_chance(path.points)[0]) <= 0.5:
+    if path is None or (chance := plant.axis_chance(path.points)[0]) <= 0.5:
         return ()
     stems = _of_path(path, surfaces, frame, upward, chance)
     return stems if upward is None else tuple(stem for stem in stems if _rises(stem.axis, upward))
@@ -124,7 +124,7 @@ class SeenPlant:
     cells: ThinCells
     leaves: Mapping[int, Floats]
 
-    def stem_chance(self, points: Floats) -> tuple[float, float]:
+    def axis_chance(self, points: Floats) -> tuple[float, float]:
         """How likely an axis (P, 3) that leaves sit on is a stem, and the share of it that enough views see. Views show
         an axis if they show most of its points, or what is within two cells of these, as thin."""
         shares = share_of_views(self.views, points, 3 * self.cells.size)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from blade_scene import SIZE, ring_cameras
-from known_leaves import bent_blade, move, turn_about
+from known_leaves import bent_blade, flat_leaf, move, turn_about
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases, find_ends
+from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.reconstruction.stem.stem_axis import StemAxis, sweep_circle
 from mvseg.reconstruction.stem.stem_path import find_path
 from mvseg.reconstruction.stem.thin_parts import ThinView, find_cells, see_thin, share_of_views
@@ -244,6 +245,18 @@ def test_a_stem_is_drawn_as_a_tube_of_its_radius() -> None:
     mesh = sweep_circle(BENT, 0.06 + 0 * T)
     assert mesh.is_watertight
     assert mesh.volume == pytest.approx(np.pi * 0.06**2 * StemAxis.along(BENT).length, rel=0.06)
+
+
+def test_stems_are_slender_for_their_plant() -> None:
+    """In any world; where all leaves are as slender, there are none."""
+    widths = dict(enumerate((10, 9, 8, 2), start=1))
+    chances = stem_chances({number: flat_leaf(length=40.0, half_width=width) for number, width in widths.items()})
+    assert chances[4] > 0.99
+    assert max(chances[number] for number in (1, 2, 3)) < 1e-6
+    small = {number: flat_leaf(length=4.0, half_width=width / 10) for number, width in widths.items()}
+    assert stem_chances(small) == pytest.approx(chances, abs=1e-6)
+    assert max(stem_chances({number: flat_leaf(length=40.0, half_width=2.0) for number in (1, 2)}).values()) < 1e-6
+    assert stem_chances({}) == {}
 
 
 def test_leaves_closer_than_their_deviation_share_a_node() -> None:

@@ -1,1 +1,1 @@
-"""Stems as tubes: curves with a radius, fitted to masks that show them, or found between the bases of leaves."""
+"""Stems: axes of masks that show them, between the bases of leaves, or along thin parts of photos."""

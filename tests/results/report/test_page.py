@@ -68,7 +68,7 @@ def test_nothing_comes_from_elsewhere_and_no_text_becomes_html() -> None:
         assert re.findall(r"innerHTML|outerHTML|insertAdjacent|document\.write|eval\(|url\(|@import", text) == []
         assert set(re.findall(r"https?://[\w./]+", text)) <= {"http://www.w3.org/2000/svg"}  # a name, never fetched
     assert "default-src 'none'" in own[-2]
-    assert sum(file.stat().st_size for file in Path(str(ASSETS)).rglob("*")) < 730_000
+    assert sum(file.stat().st_size for file in Path(str(ASSETS)).rglob("*")) < 720_000
 
 
 def test_the_same_result_gives_the_same_page(balls: Result, tmp_path: Path) -> None:
