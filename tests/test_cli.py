@@ -274,7 +274,7 @@ def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(tmp_path
         (["--version"], [f"mvseg {mvseg.__version__}"]),
         (["infer", "--help"], ["--masks", "--detect.weights", "--help_all"]),
         (["infer", "--help_all"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
-        (["batch", "--help"], ["--resume", "--num_workers", "--scheduler", "--detect.weights", "--scale", "--up"]),
+        (["batch", "--help"], ["--resume", "--num_workers", "--part", "--detect.weights", "--scale", "--up"]),
         (["batch", "--help_all"], ["--traits.min_quality", "--report"]),
         (["match", "--help"], ["[options] scenes", "--masks", "--match.method"]),
         (["train", "--help"], ["--photos", "--labels", "--resume"]),

@@ -1,9 +1,9 @@
-"""Runs many scenes, on this machine or on a cluster; finished scenes are not done again."""
+"""Runs many scenes, all or one part of them; finished scenes are not done again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import closing, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
@@ -14,7 +14,7 @@ from mvseg.batch.scene_list import BatchScene, list_scenes
 from mvseg.batch.status import STATE, TABLES, Status, scene_state, write_status
 from mvseg.batch.tables import write_tables
 from mvseg.batch.work import Finished, work_on_scene
-from mvseg.batch.workers import Engine, Lost, open_workers
+from mvseg.batch.workers import Engine, Lost, run_locally
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.results.earlier import Output, check_out
@@ -43,33 +43,40 @@ def run_batch(
     masks: Path | None = None,
     resume: bool = False,
     num_workers: int = 1,
-    scheduler: str | None = None,
+    part: tuple[int, int] | None = None,
 ) -> BatchCounts:
     """From scene folders to result folders `out/NAME` and the tables in `out/tables`. Failures are reported on stderr.
 
     Args:
         masks: in each scene folder, or beside them; None: a detector finds them.
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
-        num_workers: processes, >= 1, where no scheduler is given.
+        num_workers: processes, >= 1.
+        part: (k, n), every n-th scene from the k-th on, 1 <= k <= n: other parts may run at the same time, with the
+            same `out` on a disk that all share. It continues what is there, and writes no tables: a last run without
+            `part` that resumes does.
 
-    Raises InputError: bad input, before any scene is started: the table, `out`, the scheduler; OSError: the folder of
-    the batch cannot be written.
+    Raises InputError: bad input, before any scene is started: the table, `out`; OSError: the folder of the batch cannot
+    be written.
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
+    if part is not None and not 1 <= part[0] <= part[1]:
+        raise InputError(f"part is {part[0]}/{part[1]}, expected K/N with K from 1 to N")
     scenes = list_scenes(source, out, masks)
+    scenes = scenes if part is None else scenes[part[0] - 1 :: part[1]]
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)
     place = resolve_place(out)
-    with open_workers(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
-        _claim(out, resume=resume)
-        with lock_folder(place):
-            check_out(place / TABLES, Output("tables"))
-            if any(is_partial(path) for path in place.iterdir()):  # a run was killed
-                for scene in scenes:
-                    sweep_abandoned(place / scene.name)
-            finished = _work_on_all(scenes, engine, place)
-            rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
+    _claim(out, resume=resume or part is not None)
+    with lock_folder(place) if part is None else nullcontext():
+        check_out(place / TABLES, Output("tables"))
+        if any(is_partial(path) for path in place.iterdir()):  # a run was killed
+            for scene in scenes:
+                sweep_abandoned(place / scene.name)
+        engine = partial(run_locally, partial(work_on_scene, place, config), num_workers=num_workers)
+        finished = _work_on_all(scenes, engine, place)
+        rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
+        if part is None:
             run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
             write_tables(place / TABLES, place, rows, run={**run, "config": asdict(config)})
     done = [status for _, status in rows if status.state == "done"]

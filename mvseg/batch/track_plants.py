@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from collections.abc import Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import Any
 
 from mvseg._version import made_by
 from mvseg.batch.status import TABLES
-from mvseg.batch.workers import Engine, Lost, open_workers
+from mvseg.batch.workers import Lost, run_locally
 from mvseg.corrections.file import Edit, load_corrections
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, Output, replace_result
@@ -65,7 +65,6 @@ def track_plants(
     corrections: Path | None = None,
     pots: Pots = "auto",
     num_workers: int = 1,
-    scheduler: str | None = None,
     report: bool = True,
 ) -> list[TrackedPlant]:
     """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced. One plant is in memory
@@ -75,7 +74,6 @@ def track_plants(
         out: the tables of `write_track_tables`, tracks.html and run.json; of several plants, the pages lie in
             `plants/`, and tracks.html is their list.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
-        scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
 
     Raises InputError: `out` cannot be written, or holds something else or tracks of other results; the corrections are
     broken, or every plant failed.
@@ -89,11 +87,11 @@ def track_plants(
         places = places if len(plants) > 1 else [folder]
         work = partial(_track_plant, edits, pots=pots, report=report)
         items = dict(enumerate(zip(plants, places, strict=True)))
-        num_workers = min(num_workers, len(items))
-        opened: AbstractContextManager[Engine] = open_workers(work, num_workers, scheduler)
-        if scheduler is None and num_workers == 1:
-            opened = nullcontext(lambda items, _: ((index, work(item)) for index, item in items.items()))
-        with opened as engine, closing(engine(items, int)) as answers:
+        answers: Generator[tuple[int, TrackedPlant | Lost], None, None]
+        answers = ((index, work(item)) for index, item in items.items())
+        if (number := min(num_workers, len(items))) != 1:
+            answers = run_locally(work, items, int, num_workers=number)
+        with closing(answers):
             done = dict(progress_bar(answers, total=len(plants), name="track", unit="plant"))
         for index, answer in done.items():
             if isinstance(answer, Lost):

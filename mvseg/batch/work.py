@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import threading
 import time
 import traceback
 from dataclasses import asdict, dataclass
@@ -31,8 +30,6 @@ from mvseg.system.atomic import lock_folder, sweep_abandoned
 from mvseg.system.file_hash import hash_files
 from mvseg.system.threads import stay_on_one_thread
 
-_one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings are caught for the whole process
-
 
 @dataclass(frozen=True)
 class Finished:
@@ -48,7 +45,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     stay_on_one_thread()
     folder, place, started = scene_state(out, scene.name), out / scene.name, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
-    with _one_at_a_time, lock_folder(folder, wait=True):
+    with lock_folder(folder, wait=True):
         earlier = read_status(folder)
         try:
             request = RunRequest(scene.folder, scene.masks, place, config, corrections=scene.corrections)

@@ -45,7 +45,7 @@ MOST_USED = {
     "pose": ("photos", "out", "marker", "board", "distance", "positions", "unit", "up", "turntable"),
     "infer": ("scene", "again", "masks", "out", "config", "scale", "unit", "up", "views", "learn", "detect.weights",
               "num_workers", "corrections"),
-    "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
+    "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "part", "scale", "unit", "up",
               "detect.weights"),
     "match": ("scenes", "masks", "out", "config", "categories", "match.method"),
     "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",

@@ -84,7 +84,6 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
     "force_corrections": (bool, False, "apply --corrections even if they were made for other photos"),
     "overwrite": (bool, False, "replace what mvseg wrote to --out even if it is another scene's, or no result"),
     "num_workers": (int | None, None, "processes that fit surfaces (default: one per core, but at most 4)"),
-    "scheduler": (str | None, None, "work on a Dask cluster instead: the scheduler's address, or its file"),
     "quiet": (None, False, "no progress line"),
 }  # fmt: skip
 
@@ -97,13 +96,6 @@ def add_shared(parser: ArgumentParser, *names: str) -> None:
         kind, default, about = SHARED[name]
         form = {"action": "store_true"} if kind is None else {"type": kind, "default": default}
         parser.add_argument(f"--{name}", help=about, **form)
-
-
-def read_workers(args: Namespace) -> int:
-    """Read --num_workers of work that --scheduler may take over; 1 by default."""
-    if args.scheduler is not None and args.num_workers is not None:
-        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
-    return 1 if args.num_workers is None else int(args.num_workers)
 
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None = None) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import add_shared, read_workers
+from mvseg.cli.options import add_shared
 from mvseg.errors import InputError
 from mvseg.system.say import say
 from mvseg.tracking.config import Pots
@@ -38,20 +38,17 @@ def add_options(parser: ArgumentParser) -> None:
     help_corrections = "file with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     parser.add_argument("--report", type=bool, default=True, help="write tracks.html")
-    parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")
-    add_shared(parser, "scheduler", "quiet")
+    parser.add_argument("--num_workers", type=int, default=1, help="plants tracked at once, each in its own process")
+    add_shared(parser, "quiet")
 
 
 def run(args: Namespace) -> int:
     from mvseg.batch.track_plants import track_plants  # keeps --help quick
     from mvseg.tracking.page import PAGE_FILE
 
-    num_workers = read_workers(args)
     asked = _read_again(args) if args.again is not None else _read_results(args)
-    edits, options = args.corrections or asked.corrections, {name: args[name] for name in ("scheduler", "report")}
-    tracked = track_plants(
-        asked.plants, asked.folder, corrections=edits, pots=asked.pots, num_workers=num_workers, **options
-    )
+    edits, options = args.corrections or asked.corrections, {name: args[name] for name in ("num_workers", "report")}
+    tracked = track_plants(asked.plants, asked.folder, corrections=edits, pots=asked.pots, **options)
     for plant in tracked:
         for sentence in plant.warnings:
             say(f"mvseg: warning: {sentence}", to_stderr=True)

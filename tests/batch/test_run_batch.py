@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from batch_work import run_here
-from mvseg.batch import workers
 from mvseg.batch.run_batch import BatchCounts, run_batch
 from mvseg.batch.status import read_status, scene_state
 from mvseg.batch.workers import Lost
@@ -47,7 +46,7 @@ def plants(tmp_path: Path) -> Path:
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Work in this process."""
-    monkeypatch.setattr(workers, "run_locally", run_here)
+    monkeypatch.setattr("mvseg.batch.run_batch.run_locally", run_here)
 
 
 def arguments(scenes: Path, out: Path, *more: str) -> list[str]:
@@ -146,6 +145,24 @@ def test_a_batch_is_resumed(here: None, plants: Path, tmp_path: Path, capsys: py
     assert capsys.readouterr().out == f"{out}: 3 of 3 scenes are done\n"
 
 
+def test_parts_of_a_batch_share_its_folder(
+    here: None, plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They write no tables; a last run keeps what they did, tries again what failed, and writes the tables."""
+    out = tmp_path / "out"
+    assert main(arguments(plants, tmp_path / "whole", "--quiet")) == 3
+    capsys.readouterr()
+    assert main(arguments(plants, out, "--quiet", "--part", "2/2")) == 3  # cactus
+    with lock_folder(out):  # whoever has the whole batch hinders no part
+        assert main(arguments(plants, out, "--quiet", "--part", "1/2")) == 0
+    assert capsys.readouterr().out == f"{out}: 0 of 1 scenes are done\n{out}: 2 of 2 scenes are done\n"
+    assert sorted(path.name for path in out.iterdir()) == ["_batch", "basil", "mint"]
+    assert main(arguments(plants, out, "--quiet", "--resume", "true")) == 3
+    assert capsys.readouterr().out == f"{out}: 2 of 3 scenes are done (2 of them before)\n"
+    for name in ("traits.csv", "traits_wide.csv", "failures.csv"):
+        assert (out / "tables" / name).read_bytes() == (tmp_path / "whole" / "tables" / name).read_bytes()
+
+
 def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
     plants: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -158,7 +175,7 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
             dies = item.name == "basil" or (item.name == "mint" and len(items) > 1)
             yield key, Lost("was killed") if dies else work(item)
 
-    monkeypatch.setattr(workers, "run_locally", run)
+    monkeypatch.setattr("mvseg.batch.run_batch.run_locally", run)
     assert main(arguments(plants, tmp_path / "out", "--quiet", "--num_workers", "3")) == 3
     assert rounds == [["basil", "cactus", "mint"], ["basil"], ["mint"]]
     said = capsys.readouterr().err
@@ -211,27 +228,12 @@ def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == ["_batch", "mint", "tables"]
 
 
-@pytest.mark.slow
-def test_scenes_on_a_dask_cluster(plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    distributed = pytest.importorskip("distributed")
-    dask = pytest.importorskip("dask")
-    folder = str(tmp_path / "dask")
-    with (
-        dask.config.set({"temporary-directory": folder}),
-        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0") as cluster,
-    ):
-        address = cluster.scheduler_address
-        assert main(arguments(plants, tmp_path / "out", "--quiet", "--scheduler", address)) == 3
-    assert capsys.readouterr().out == f"{tmp_path / 'out'}: 2 of 3 scenes are done\n"
-    assert len(read_table(tmp_path / "out" / "tables" / "traits_wide.csv")) == 6
-
-
 @pytest.mark.parametrize(
     ("more", "message"),
     [
         (["--num_workers", "0"], "num_workers is 0, expected at least 1"),
-        (["--num_workers", "2", "--scheduler", "x"], "--num_workers has no effect with --scheduler"),
-        (["--scheduler", "nowhere.json"], "nowhere.json: cannot be read"),
+        (["--part", "3"], "--part is '3', expected K/N, as 3/20"),
+        (["--part", "0/2"], "part is 0/2, expected K/N with K from 1 to N"),
         (["--match.num_points", "0"], "num_points is 0"),
         (["--masks", "null", "--detect.weights", "no.safetensors"], "'no.safetensors' is neither a shipped detector"),
     ],

@@ -126,16 +126,6 @@ def test_tables_of_many_plants_are_those_of_each_one_below_the_other(tmp_path: P
         assert read(tmp_path / "all" / name) == [*read(tmp_path / "a" / name), *read(tmp_path / "b" / name)]
 
 
-def test_plants_are_tracked_on_a_dask_cluster(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
-    rows = [(f"{plant}{day}", plant, str(day)) for plant in "ab" for day in (0, 1)]
-    batch = write_batch(tmp_path / "batch", rows)
-    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as cluster:
-        arguments = ["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--report", "false"]
-        assert main([*arguments, "--scheduler", cluster.scheduler_address]) == 0
-    assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a", "b"}
-
-
 @pytest.mark.slow
 def test_the_two_dates_that_ship(tmp_path: Path) -> None:
     """The quick start, with half of the leaves: another pot, other cameras, one leaf gone, one new."""
