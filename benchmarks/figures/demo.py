@@ -17,7 +17,7 @@ from mvseg.formats.image_file import read_rgb
 from mvseg.formats.label_png import read_labels
 
 ROOT = Path(__file__).parents[2]
-VIEWS = ("001", "004", "007")
+VIEWS = ("003", "004", "007")
 HEIGHT = 330  # pixels of each picture
 MARGIN = 0.12  # around the plant, of its longer side
 FINE = 3  # small pixels per pixel, along a side, of drawn leaves
@@ -48,7 +48,8 @@ def draw_meshes(path: Path, azimuth_deg: float, elevation_deg: float = 25.0) -> 
     parts: list[Any] = [scene.geometry[scene.graph[name][1]].copy() for name in scene.graph.nodes_geometry]
     for part, name in zip(parts, scene.graph.nodes_geometry, strict=True):
         part.apply_transform(scene.graph[name][0])
-    colors = np.array([part.visual.material.baseColorFactor[:3] for part in parts], dtype=float)
+    linear = np.array([part.visual.material.baseColorFactor[:3] for part in parts]) / 255  # as glTF has it
+    colors = 255 * linear ** (1 / 2.2)
     owner = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
     mesh: Any = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
-from mvseg.corrections.file import Corrections, Point, load_corrections, name_edits
+from mvseg.corrections.file import Corrections, Point, dump_edits, load_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.detection.cached_detections import CachedDetections
@@ -82,6 +82,7 @@ class OpenResult:
         self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self._before: tuple[Plant, Mapping[int, LeafSurface] | None] | None = None  # before edits, and its surfaces
+        self._newest: tuple[Result, list[Picture]] | None = None  # that the page corrects, and a picture of each view
         self.summary_before = ""  # of the result that the newest whole one replaced
         self.learned: tuple[Plant, list[Finding]] | None = None  # since the detector learned the plant
 
@@ -100,17 +101,14 @@ class OpenResult:
         return with_marks(corrections, self.scene, self.marks)
 
     def page(self, corrections: Corrections) -> str:
-        run, (result, pictures) = self.run.record.as_json(), self._page_result
-        run["card"] = {**(run.get("card") or {}), "before": self.summary_before}
-        return build_page(replace(result, corrections=corrections), pictures, run=run, is_served=True)
+        run, (saved, pictures) = self.run.record.as_json(), self._saved_page
+        made_with = () if saved.corrections is None else saved.corrections.edits
+        run["card"] = (run.get("card") or {}) | {"before": self.summary_before, "edits": dump_edits(made_with)}
+        return build_page(replace(saved, corrections=corrections), pictures, run=run, is_served=True)
 
     def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
         result, outcomes, messages = self.recompute(corrections, is_old)
-        saved = self.saved_result
-        made_with = () if saved.corrections is None else saved.corrections.edits
-        if self.learned is None and name_edits(corrections.edits) == name_edits(made_with):
-            result = replace(result, instances=saved.instances)
-        before, pictures = self._page_result
+        before, pictures = self._newest or self._saved_page
         sizes = result.scene.cameras.sizes.tolist()
         pictures = [each.with_masks(result.masks, view=n, size=tuple(sizes[n])) for n, each in enumerate(pictures)]
         known = () if before.corrections is None else before.corrections.edits
@@ -119,14 +117,14 @@ class OpenResult:
         news = describe_update(result, pictures)
         news["told"] = tell_drawn(result, new=new, angles=measure_angles(result))
         news["agreedArea"] = () if self.learned is None else self.learned[0].learned.agreed_area
-        self._page_result = result, pictures
+        self._newest = result, pictures
         yield Update(news, outcomes, vanished + messages)
         if not self.opened.holds:
             self._now[0].draw_ahead()
 
     @cached_property
-    def _page_result(self) -> tuple[Result, list[Picture]]:
-        """The newest result, and a picture of each view; at first, what lies in the folder."""
+    def _saved_page(self) -> tuple[Result, list[Picture]]:
+        """The whole result in the folder, and a picture of each view."""
         saved, views = self.saved_result, range(len(self.scene.views))
         return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
 
@@ -159,7 +157,8 @@ class OpenResult:
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(plant, corrections)
             result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
-        shown = keep_numbers(replace(result, corrections=corrections), self._numbers, self._page_result[0].masks)
+        previous, _ = self._newest or self._saved_page
+        shown = keep_numbers(replace(result, corrections=corrections), self._numbers, previous.masks)
         told = {"edit", *(each.get("code") for each in self.run.record.findings)}
         new = dict.fromkeys(as_sentence(each) for each in noticed + more if each.code not in told)
         return shown, [describe_fate(fate) for fate in shown.fates], [*new]

@@ -103,7 +103,7 @@ def read_traits(
     is given, as {leaf: kind of its rejection}. Raises InputError if these are no such tables."""
     numbers: dict[int, dict[str, Measurement]] = {0: {}}
     try:
-        for row in read_csv(long, COLUMNS):
+        for row in read_csv(long, COLUMNS[:7]):  # ontologies are for readers of tables
             value, sd = float(row["value"] or "nan"), float(row["sd"] or "nan")
             numbers.setdefault(int(row["leaf"] or 0), {})[row["trait"]] = Measurement(value, sd, row["method"])
         leaves = [
@@ -120,15 +120,15 @@ def read_traits(
 
 
 def _read_leaf(
-    leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement], rejection: Kind | None, *, unit: str
+    leaf: int, row: Mapping[str, str], numbers: dict[str, Measurement], rejection: Kind | None, *, unit: str
 ) -> LeafTraits:
     texts = [] if row["quality"] == GOOD else row["quality"].split("; ")
     codes = row["doubts"].split("; ") if "doubts" in row else texts  # an older version has none
-    # The only ones that have no row: where there are no voxels, and in tables of older versions.
-    absent = {name: missing("has no voxels") for name in VOXEL_NAMES} | {"node_height": missing("of an older version")}
+    # where there are no voxels, and in tables of older versions, some have no row
+    numbers = dict.fromkeys(VOXEL_NAMES, missing("has no voxels")) | numbers
     return LeafTraits(
         leaf=leaf,
-        numbers={trait.name: {**absent, **numbers}[trait.name] for trait in LEAF_TRAITS},
+        numbers={trait.name: numbers.get(trait.name, missing("of an older version")) for trait in LEAF_TRAITS},
         method=row["method"],
         reasons=dict(zip(codes, texts, strict=False)),
         rejection=rejection,

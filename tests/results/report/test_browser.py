@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mvseg.results.result import Instances, Result
@@ -81,7 +82,7 @@ def everywhere(leaf: int) -> dict[str, list[int]]:
 
 
 def test_the_picture_in_3d_can_be_printed(opened: Viewer) -> None:
-    """It stays in its canvas, in its own proportions, and numbers are placed in parts of it."""
+    """It stays in its canvas, in its own proportions, and numbers are placed in parts of it, none on another."""
     count = """() => {
       const canvas = document.getElementById("canvas"), copy = document.createElement("canvas");
       [copy.width, copy.height] = [canvas.width, canvas.height];
@@ -100,6 +101,9 @@ def test_the_picture_in_3d_can_be_printed(opened: Viewer) -> None:
     printed = opened.page.evaluate(ratio)
     opened.page.emulate_media(media="screen")
     assert printed == pytest.approx(shown, rel=0.05)
+    opened.page.evaluate("for (const label of page.labels) label.at = page.labels[0].at; page.placeLabels()")
+    spots = opened.page.evaluate("page.labels.slice(0, 3).map(({ spot }) => spot)")
+    assert min(np.linalg.norm(np.subtract(spots[n], spots[n - 1])) for n in range(3)) > 10
 
 
 def test_a_click_anywhere_selects_the_leaf_everywhere(opened: Viewer) -> None:

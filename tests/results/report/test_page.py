@@ -68,14 +68,14 @@ def test_nothing_comes_from_elsewhere_and_no_text_becomes_html() -> None:
         assert re.findall(r"innerHTML|outerHTML|insertAdjacent|document\.write|eval\(|url\(|@import", text) == []
         assert set(re.findall(r"https?://[\w./]+", text)) <= {"http://www.w3.org/2000/svg"}  # a name, never fetched
     assert "default-src 'none'" in own[-2]
-    assert sum(file.stat().st_size for file in Path(str(ASSETS)).rglob("*")) < 720_000
+    assert sum(file.stat().st_size for file in Path(str(ASSETS)).rglob("*")) < 660_000
 
 
 def test_the_same_result_gives_the_same_page(balls: Result, tmp_path: Path) -> None:
     first, second = (write_page(tmp_path / name, balls).read_bytes() for name in ("a.html", "b.html"))
     assert first == second
     assert b"\r" not in first
-    assert len(first) < 770_000
+    assert len(first) < 710_000
 
 
 def test_scores_and_ids_are_those_of_the_result(balls: Result) -> None:

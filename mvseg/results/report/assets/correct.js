@@ -54,7 +54,7 @@ class Work {
   update({ views, leaves, doubts, numMasks }) {
     views.forEach(({ masks }, index) => { this.data.views[index].masks = masks; });
     Object.assign(this.data, { leaves, numMasks });
-    summarise(this.data);
+    if (!document.getElementById("correct").hidden) summarise(this.data);
     this.data.correct.doubts = doubts;
     this.read();
     this.picks = this.picks.flatMap((pick) => this.pickAgain(pick));
@@ -444,15 +444,15 @@ function buildModes(data, addresses) {
   const modes = { work: null, show };
   function show(mode) {
     if (data.correct.isServed) window.history.replaceState(null, "", `#${mode}`); // a reload stays in the mode
-    if (mode === "look" && modes.work?.server?.isNewer) return window.location.reload();
     for (const [name, button] of Object.entries(buttons)) {
       button.setAttribute("aria-pressed", name === mode);
       for (const part of parts[name]) part.hidden = name !== mode;
     }
     if (mode === "correct") {
-      modes.work ??= new Work(data, addresses);
+      modes.work ??= new Work({ ...data, views: data.views.map((view) => ({ ...view })) }, addresses); // "Look" keeps its data
       if (data.correct.isServed && !modes.work.server) modes.work.server = new Server(modes.work);
-    }
+    } else buildCard(data, modes.work);
+    summarise(mode === "look" ? data : modes.work.data);
   }
   for (const [name, button] of Object.entries(buttons)) button.addEventListener("click", () => show(name));
   const { hash } = window.location;

@@ -18,9 +18,6 @@ function describePlant(data) {
   const parts = [element("h2", {}, "The plant"), element("p", { class: "note" }, hint)];
   if (data.plantTraits.length) {
     parts.push(element("h3", {}, "Traits of the plant"), traitTable(data.plantTraits, data.whole));
-  } else if (data.correct.isServed) {
-    const how = "Traits were not measured since your edits: \u201cMake the whole result\u201d (Correct) measures them.";
-    parts.push(element("p", { class: "doubt" }, how));
   }
   parts.push(...data.stems.flatMap((stem) => describeStem(stem, data)));
   if (rejected) {

@@ -11,16 +11,30 @@ function inSymbols(text) {
   return text.replaceAll(" +- ", " \u00b1 ").replace(/\^2\b/g, "\u00b2");
 }
 
-// `mvseg correct` serves the page that a command would open, and may have replaced another result.
-function buildCard(card, { traits, correct: { isServed } }) {
-  const place = document.getElementById("card");
-  const isStale = isServed && !traits.length && card?.found?.includes("area");
-  const next = isServed ? card?.next_step?.replace(/: mvseg correct .*/, ": \u201cCorrect\u201d, above") : card?.next_step;
-  const lines = card ? [["before", card.before], [isStale ? "found before your edits" : "found", card.found],
-    ["in doubt", card.doubt], ["next", next]] : [];
+// The number of leaves, and all other numbers that changed, as "before \u2192 now".
+function compareFound(before, now) {
+  const [old, parts] = [before, now].map((text) => text.split(/(\d[\d,.]*)/));
+  if (old.length !== parts.length) return `${before} \u2192 ${now}`;
+  return parts.map((part, n) => (n === 1 || (n % 2 && part !== old[n]) ? `${old[n]} \u2192 ${part}` : part)).join("");
+}
+
+// `mvseg correct` serves the page that a command would open, shows the last whole result, and may have replaced another.
+function buildCard({ run: { card }, correct: { isServed, edits } }, work) {
+  if (!card) return;
+  const since = [];
+  if (isServed) {
+    const [made, now] = [card.edits, work?.edits.list ?? edits].map((list) => list.map((edit) => JSON.stringify(edit)));
+    const changed = [...made.filter((edit) => !now.includes(edit)), ...now.filter((edit) => !made.includes(edit))].length;
+    if (changed) since.push(count(changed, "edit"));
+    if (work?.server?.learning?.isLearned) since.push("learning");
+  }
+  const next = isServed ? card.next_step?.replace(/: mvseg correct .*/, ": \u201cCorrect\u201d, above") : card.next_step;
+  const whole = `${since.join(" and ")}; \u201cMake the whole result\u201d (Correct) shows the new numbers`;
+  const lines = [["since this result", since.length ? whole : ""],
+    ["found", card.before ? compareFound(card.before, card.found) : card.found], ["in doubt", card.doubt], ["next", next]];
   const terms = lines.filter(([, text]) => text)
     .flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, inSymbols(text))]);
-  if (terms.length) place.append(element("dl", {}, ...terms));
+  document.getElementById("card").replaceChildren(...(terms.length ? [element("dl", {}, ...terms)] : []));
 }
 
 function buildRun(data) {
@@ -28,12 +42,9 @@ function buildRun(data) {
   const findings = run.findings ?? [];
   const warnings = findings.filter(({ level }) => level !== "note");
   document.getElementById("plant").textContent = data.plant;
-  summarise(data);
   const link = document.getElementById("findings-link");
   link.textContent = count(warnings.length, "warning");
   link.hidden = warnings.length === 0;
-
-  buildCard(run.card, data);
 
   const list = findings.length
     ? element("ul", {}, ...findings.map(({ level, topic, sentence }) => element("li", {}, `${level}, ${topic}: ${sentence}`)))

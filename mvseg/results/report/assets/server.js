@@ -7,7 +7,6 @@ class Server {
     this.work = work;
     this.outcomes = []; // of each edit, what hinders it; "" for nothing
     this.number = -1; // of the newest state that is known
-    this.isNewer = false; // the page shows another result than it was made of
     this.messages = {}; // problems, by what they are of
     this.state = "";
     this.unsaved = false;
@@ -103,7 +102,6 @@ class Server {
     if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
     if (isStep && this.work.panel) return this.work.panel.showStep(doing);
     if (update) {
-      this.isNewer ||= !isFirst;
       this.work.update(update);
     }
     if (this.before && !learning.now && (update || !isComputing)) {

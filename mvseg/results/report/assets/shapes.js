@@ -1,4 +1,7 @@
-// What stands in the 3D view: leaves, cameras, the grid, and a photo behind the leaves.
+// What stands in the 3D view: leaves, cameras, the ground, and a photo behind the leaves.
+
+const LIGHT = [0.3, 1, 0.2]; // the direction to it: y is up
+const SHADOW = { pixels: 512, reach: 1.7, blur: 6, color: "rgba(20, 30, 20, 0.32)" }; // half the side of its picture
 
 function makeLeaf(leaf, { points, faces }) {
   const positions = Float32Array.from(new Int16Array(bytesOf(points).buffer), (step) => step / 32767);
@@ -92,27 +95,61 @@ function paintTexture(texture, masks) {
   texture.needsUpdate = true;
 }
 
-function makeGrid(space) {
+// Squares, a bar as long as one of them, and from where the first photo was taken.
+function makeGround(space) {
   const step = space.grid / space.radius;
   const half = Math.ceil(1 / step) * step;
   const lines = [];
   for (let at = -half; at <= half + step / 2; at += step) {
     lines.push([at, -half], [at, half], [-half, at], [half, at]);
   }
-  const points = lines.map(([x, z]) => new THREE.Vector3(x, space.ground, z));
+  const place = ([x, z]) => new THREE.Vector3(x, space.ground, z);
   const material = new THREE.LineBasicMaterial({ color: 0x8a988c, transparent: true, opacity: 0.35 });
-  return new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), material);
+  const grid = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(lines.map(place)), material);
+  const mark = new THREE.MeshBasicMaterial({ color: 0x5d675d, side: THREE.DoubleSide });
+  const start = -step * Math.round(0.7 / step);
+  const ends = [[0, 0], [step, 0], [step, 0.03], [0, 0.03]].map(([x, z]) => place([start + x, z - start]));
+  grid.add(new THREE.Mesh(makeSheet(ends), mark));
+  grid.userData.bar = place([start + step / 2, 0.1 - start]);
+  const [x, , z] = space.cameras[0].center;
+  const away = Math.hypot(x, z);
+  const at = (ahead, beside) => place([(ahead * x - beside * z) / away, (ahead * z + beside * x) / away]);
+  if (away > 0.1) {
+    grid.add(new THREE.Mesh(makeSheet([at(0.8, 0), at(0.8, 0), at(0.9, 0.05), at(0.9, -0.05)]), mark));
+    grid.userData.camera = at(1.03, 0);
+  }
+  return grid;
 }
 
-function makeSky() {
-  return new THREE.HemisphereLight(0xffffff, 0x909890, 1.9);
-}
-
-// Moves with the viewer.
+// From above, as the shadow falls.
 function makeLamp() {
-  const lamp = new THREE.DirectionalLight(0xffffff, 1.6);
-  lamp.position.set(0.4, 0.8, 1);
+  const lamp = new THREE.DirectionalLight(0xffffff, 1.5);
+  lamp.position.set(...LIGHT);
   return lamp;
+}
+
+// The soft shadow of meshes on the ground, as a picture.
+function makeShadow(meshes, { ground }, draw) {
+  const canvas = element("canvas", { width: SHADOW.pixels, height: SHADOW.pixels });
+  const pen = canvas.getContext("2d");
+  let path = "";
+  const scale = SHADOW.pixels / (2 * SHADOW.reach);
+  for (const { geometry: { attributes: { position }, index } } of meshes) {
+    const corners = Array.from(index.array, (n) => [0, 2].map((axis) =>
+      scale * (position.array[3 * n + axis] - (position.getY(n) - ground) * LIGHT[axis] + SHADOW.reach)));
+    for (let n = 0; n < corners.length; n += 3) {
+      const [a, b, c] = corners.slice(n, n + 3);
+      const isTurned = (b[0] - a[0]) * (c[1] - a[1]) < (b[1] - a[1]) * (c[0] - a[0]); // so that none is a hole in another
+      path += `M${(isTurned ? [a, c, b] : [a, b, c]).join("L")}Z`;
+    }
+  }
+  pen.filter = `blur(${SHADOW.blur}px)`;
+  pen.fillStyle = SHADOW.color;
+  pen.fill(new Path2D(path));
+  const [low, high] = [-SHADOW.reach, SHADOW.reach];
+  const sheet = makeSheet([[low, low], [high, low], [high, high], [low, high]].map(([x, z]) => new THREE.Vector3(x, ground, z)));
+  const map = loadTexture(canvas.toDataURL(), draw);
+  return new THREE.Mesh(sheet, new THREE.MeshBasicMaterial({ map, transparent: true, depthWrite: false, side: THREE.DoubleSide }));
 }
 
 function makeBackdrop() {

@@ -1,10 +1,10 @@
-// The 3D view: leaves, cameras with their photos, a grid on the ground. It is drawn when something changes only.
+// The 3D view: leaves, cameras with their photos, the ground. It is drawn when something changes only.
 
 const FIELD = 35; // degrees
 const FADED = 0.16; // opacity of leaves that are not selected
 const OVER_PHOTO = 0.55; // of all leaves, before a photo
-const LAYERS = { leaves: true, stems: true, nodes: false, photos: true, masks: false, numbers: true, grid: true };
-const LONGEST_BAR = 120; // pixels of the scale bar
+const LAYERS = { leaves: true, stems: true, nodes: false, photos: true, masks: false, numbers: true, ground: true };
+const LABEL = { letter: 7, line: 13, steps: [0, 11, 20] }; // pixels; how far a number may be from its leaf
 
 class Space {
   constructor(data, addresses, renderer) {
@@ -22,16 +22,17 @@ class Space {
     const textures = addresses.thumbnails.map((address) => loadTexture(address, () => this.paintMasks()));
     this.cameras = data.space.cameras.map((entry, view) =>
       makeCamera(entry, data.views[view], { view, share, texture: textures[view] }));
-    this.ground = makeGrid(data.space);
+    this.ground = makeGround(data.space);
     this.backdrop = makeBackdrop();
     this.groups = {
       leaves: this.leaves.map((leaf) => leaf.mesh), stems: data.space.stems.map(makeStem),
       nodes: data.space.nodes.map((node) => makeNode(node, data.leaves.find((leaf) => leaf.id === node.leaf))),
     };
+    this.ground.add(makeShadow([...this.groups.leaves, ...this.groups.stems], data.space, () => this.draw()));
     this.scene = new THREE.Scene().add(
-      makeSky(), this.camera.add(makeLamp()), this.ground, this.backdrop,
+      new THREE.HemisphereLight(0xffffff, 0xb8c0b8, 2), makeLamp(), this.ground, this.backdrop,
       ...Object.values(this.groups).flat(), ...this.cameras.map((one) => one.group));
-    this.labels = makeLabels(this.leaves);
+    this.labels = makeLabels(this.leaves, this.ground.userData, data);
     this.layers = makeLayers(data, () => this.showLayers());
   }
 
@@ -80,11 +81,10 @@ class Space {
   }
 
   showLayers() {
-    const { leaves, stems, nodes, numbers } = this.layers;
+    const { leaves, stems, nodes } = this.layers;
     for (const [name, box] of Object.entries({ leaves, stems, nodes })) {
       for (const mesh of this.groups[name]) mesh.visible = box.checked;
     }
-    document.getElementById("space-labels").hidden = !numbers.checked;
     this.paintMasks();
     this.showBackdrop(this.shown);
   }
@@ -100,33 +100,39 @@ class Space {
 
   drawNow() {
     this.renderer.render(this.scene, this.camera);
-    this.drawScale();
-    for (const { leaf, text } of this.labels) {
-      const { x, y, isAhead } = this.positionOf(leaf.id);
-      text.style.visibility = isAhead ? "visible" : "hidden";
+    this.placeLabels();
+    for (const { text, spot } of this.labels) {
+      text.style.visibility = spot ? "visible" : "hidden";
+      if (!spot) continue;
       // in parts of the picture, so that they stand beside their leaves on paper, too
-      text.style.left = `${((100 * x) / this.canvas.clientWidth).toFixed(2)}%`;
-      text.style.top = `${((100 * y) / this.canvas.clientHeight).toFixed(2)}%`;
+      text.style.left = `${((100 * spot[0]) / this.canvas.clientWidth).toFixed(2)}%`;
+      text.style.top = `${((100 * spot[1]) / this.canvas.clientHeight).toFixed(2)}%`;
       text.style.transform = "translate(-50%, -50%)";
     }
   }
 
-  // A length at the middle of the view.
-  drawScale() {
-    const { camera, canvas, data } = this;
-    const depth = -this.controls.target.clone().applyMatrix4(camera.matrixWorldInverse).z;
-    const px = (camera.projectionMatrix.elements[5] * canvas.clientHeight) / 2 / depth / data.space.radius;
-    const power = 10 ** Math.floor(Math.log10(LONGEST_BAR / px));
-    const length = [5, 2, 1].find((step) => step * power * px <= LONGEST_BAR) * power;
-    this.bar = { width: length * px, text: `${Number(length.toPrecision(6))} ${data.unit}` };
-    const [text, line] = document.getElementById("space-scale").children;
-    text.textContent = this.bar.text;
-    line.style.width = `${this.bar.width.toFixed(1)}px`;
+  // No label lies on another: the nearer one stays, and the other moves aside, or is hidden. Each gets its `spot`.
+  placeLabels() {
+    const { selected, hovered } = selection;
+    const isLit = ({ leaf }) => Boolean(leaf) && [selected, hovered].includes(leaf.id);
+    const isShown = ({ leaf }) => (leaf ? this.layers.leaves.checked && this.layers.numbers.checked : this.ground.visible);
+    const ordered = this.labels.map((label) => ({ label, ...this.pixelOf(label.at) }))
+      .sort((a, b) => isLit(b.label) - isLit(a.label) || a.depth - b.depth);
+    const placed = [];
+    for (const { label, x, y, depth } of ordered) {
+      const width = LABEL.letter * (label.text.textContent.length + 0.5);
+      const tries = LABEL.steps.flatMap((step) => [0, 1, 2, 3, 4, 5, 6, 7].map((n) =>
+        [x + step * Math.cos(n * Math.PI / 4), y + step * Math.sin(n * Math.PI / 4)]));
+      const isFree = ([left, top]) => placed.every(([otherX, otherY, other]) =>
+        Math.abs(left - otherX) > (width + other) / 2 || Math.abs(top - otherY) > LABEL.line);
+      label.spot = (depth < 1 && isShown(label) && tries.find(isFree)) || null;
+      if (label.spot) placed.push([...label.spot, width]);
+    }
   }
 
-  // What is shown, as an SVG: a picture of the leaves; numbers and the scale bar are text.
+  // What is shown, as an SVG: a picture of the leaves; labels are text.
   figure() {
-    const { renderer, canvas, bar } = this;
+    const { renderer, canvas } = this;
     const { clientWidth: width, clientHeight: height } = canvas;
     const ratio = renderer.getPixelRatio();
     renderer.setPixelRatio(LARGER);
@@ -138,11 +144,8 @@ class Space {
       x, y, "font-size": 12, "font-weight": 600, "text-anchor": "middle", fill: PAPER.ink, stroke: PAPER.back,
       "stroke-width": 2.5, "paint-order": "stroke",
     }, text);
-    const numbers = this.layers.numbers.checked ? this.labels.map(({ leaf }) => [leaf.id, this.positionOf(leaf.id)]) : [];
     return drawing("svg", { viewBox: `0 0 ${width} ${height}` }, image,
-      ...numbers.filter(([, { isAhead }]) => isAhead).map(([id, { x, y }]) => write(x, y + 4, id)),
-      drawing("path", { d: `M${width - 16 - bar.width} ${height - 16}h${bar.width}`, stroke: PAPER.ink, "stroke-width": 3 }),
-      write(width - 16 - bar.width / 2, height - 24, bar.text));
+      ...this.labels.filter(({ spot }) => spot).map(({ text, spot: [x, y] }) => write(x, y + 4, text.textContent)));
   }
 
   resize() {
@@ -159,9 +162,12 @@ class Space {
 
   // Where the middle of a leaf is seen, in pixels of the canvas.
   positionOf(id) {
-    const leaf = this.leaves.find((one) => one.id === id);
-    const { x, y, z } = leaf.middle.clone().project(this.camera);
-    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight, isAhead: z < 1 };
+    return this.pixelOf(this.leaves.find((one) => one.id === id).middle);
+  }
+
+  pixelOf(point) {
+    const { x, y, z } = point.clone().project(this.camera);
+    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight, depth: z };
   }
 
   litLeaves() {
@@ -178,7 +184,7 @@ class Space {
       material.depthWrite = material.opacity === 1;
       material.emissiveIntensity = isLit ? 0.45 : 0;
     }
-    for (const { text, leaf } of this.labels) {
+    for (const { text, leaf } of this.labels.filter((label) => label.leaf)) {
       const isLit = leaf.id === selected || leaf.id === hovered;
       text.classList.toggle("lit", isLit);
       text.classList.toggle("faded", selected !== null && !isLit);
@@ -232,7 +238,7 @@ class Space {
   showBackdrop(view) {
     this.shown = view;
     this.backdrop.visible = view !== null;
-    this.ground.visible = view === null && this.layers.grid.checked;
+    this.ground.visible = view === null && this.layers.ground.checked;
     for (const one of this.cameras) one.group.visible = view === null && this.layers.photos.checked;
     const note = document.getElementById("space-note");
     note.textContent = view === null ? describeSpace(this.data)
@@ -263,12 +269,14 @@ function describeSpace(data) {
   return (hasLeaves ? "" : "Cameras only: there are no shapes in 3D. ") + squares + up;
 }
 
-function makeLabels(leaves) {
-  return leaves.map((leaf) => {
-    const text = element("span", {}, String(leaf.id));
-    document.getElementById("space-labels").append(text);
-    return { leaf, text };
-  });
+// Numbers of the leaves, and words on the ground; `at` is in the page's frame.
+function makeLabels(leaves, { bar, camera }, { space, unit, views }) {
+  const step = `${Number(space.grid.toPrecision(6))} ${unit}`;
+  const words = [[bar, step], [camera, `camera ${shortNames(views.map(({ name }) => name))[0]}`]].filter(([at]) => at);
+  const labels = [...leaves.map((leaf) => [leaf.middle, `${leaf.id}`, leaf]), ...words].map(([at, words, leaf]) =>
+    ({ at, leaf, text: element("span", { class: leaf ? null : "ground" }, words) }));
+  document.getElementById("space-labels").append(...labels.map(({ text }) => text));
+  return labels;
 }
 
 // {layer: its checkbox}, for the layers that there are.
