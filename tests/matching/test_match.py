@@ -104,7 +104,7 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
 
 @pytest.mark.parametrize(
     ("shift", "code", "share", "views"),
-    [(1, "views_disagree", 0.55, ()), (-1, "views_disagree", 0.4, ()), (2, "views_odd", None, (7, 8))],
+    [(1, "views_disagree", 0.55, ()), (-1, "views_disagree", 0.55, ()), (2, "views_odd", None, (7, 8))],
 )
 def test_cameras_of_other_photos_are_warned_of(
     shift: int,

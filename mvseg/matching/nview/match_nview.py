@@ -86,8 +86,9 @@ class FoundClusters:
 def find_clusters(
     regions: Regions, cameras: Cameras, graph: ViewGraph, *, residual_px: int | None = None
 ) -> FoundClusters:
-    """The clusters of D regions, ordered by view, that explain all views best, or where hypotheses explain too little,
-    those from the weights alone. `residual_px`: see `match_nview`."""
+    """The clusters of D regions, ordered by view, that explain all views best, or where hypotheses explain too little
+    of those from the weights alone, these: a search among wrong hypotheses finds clusters that these explain well.
+    `residual_px`: see `match_nview`."""
     pairwise = one_per_view_clusters(graph.without_links)
     scores, residual_px = select_dilation(regions, cameras, graph, pairwise=pairwise, residual_px=residual_px)
 
@@ -98,10 +99,10 @@ def find_clusters(
         free = Clusters.of(np.where(graph.is_linked, len(unlinked) + graph.node, unlinked.ids))
         return search(scored, one_per_view_clusters(graph), more_starts=[free])
 
-    clusters, method = first_without_links(graph, cluster) if len(cameras) > 2 else pairwise, "nview"
-    if len(cameras) < 3 or scores.explained(clusters) < NVIEW.unexplained:
-        clusters, method = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)), "one-per-view"
-    return FoundClusters(clusters, pairwise, scores, residual_px, method)
+    if len(cameras) < 3 or scores.explained(pairwise) < NVIEW.unexplained:
+        clusters = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph))
+        return FoundClusters(clusters, pairwise, scores, residual_px, "one-per-view")
+    return FoundClusters(first_without_links(graph, cluster), pairwise, scores, residual_px, "nview")
 
 
 def select_dilation(
