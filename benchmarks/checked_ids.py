@@ -34,7 +34,6 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
@@ -66,9 +65,10 @@ def read_given(folder: Path) -> Given:
 
 def choose_given(matched: Masks, cameras: Cameras) -> Masks:
     """The masks with the ids that hold once surfaces checked them."""
-    judges = Judges(cameras.to("cpu"), holds=True, cache=SurfaceCache())
+    judges = Judges(cameras.to("cpu"), holds=True, cache={})
     again = find_again(matched, judges, MatchConfig())
-    return choose_leaves(matched, [each for each in (matched, again) if each is not None], judges).masks
+    tables = {"matched": matched} | ({} if again is None else {"matched again": again})
+    return choose_leaves(matched, tables, judges).masks
 
 
 def list_masks(args: argparse.Namespace) -> Iterator[Given]:

@@ -27,9 +27,7 @@ from scipy.special import expit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.detection.config import DetectConfig
-from mvseg.detection.detect_scene import detect_scene
-from mvseg.detection.find_leaves import find_leaves
+from mvseg.config import RunConfig
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
@@ -38,6 +36,8 @@ from mvseg.formats.lens import undistort
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
+from mvseg.pipeline.find_in_photos import run_pass
+from mvseg.pipeline.open_scene import Opened
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
 from mvseg.verification.candidates import Candidates, gather_candidates
@@ -76,9 +76,10 @@ def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
         return None
     scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
-    found = find_leaves(detect_scene(Photos(scene), DetectConfig(image_size=size)), scene.cameras)
-    table, matched = found.proposals, found.matched
-    candidates = gather_candidates(matched, table, Judges(scene.cameras).fit)
+    opened = Opened(scene, Photos(scene), RunConfig())
+    plant = run_pass(opened, size, cache=None)
+    table = plant.proposals
+    candidates = gather_candidates(plant.matched, table, Judges(scene.cameras).fit)
     drawn = draw_views(table.regions, candidates.surfaces, scene.cameras, photos=Photos(scene))
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]

@@ -37,7 +37,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.choice import true_maps
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import Annotations, annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -46,6 +45,7 @@ from mvseg.evaluation.truth import true_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
+from mvseg.pipeline.mask_rcnn import MultiViewMaskRCNN
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample

@@ -18,10 +18,10 @@ from torch import Tensor
 
 from benchmarks.faults import Faults, degrade_labels
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.truth import true_instances
 from mvseg.formats.image_file import read_rgb
+from mvseg.pipeline.mask_rcnn import MultiViewMaskRCNN
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs, scene_cameras

@@ -15,6 +15,7 @@ import argparse
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +136,8 @@ def main() -> None:
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
-            stays = stays and plant.rate_by(before).agreed_area > GROWTH * before.rating.agreed_area
+            after = replace(plant, colors=before.leaf_colors).rating
+            stays = stays and after.agreed_area > GROWTH * before.rating.agreed_area
             name = f"round {number}, at {plant.image_size} px"
             show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
         if args.person and truth is not None:

@@ -26,14 +26,12 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.choice import true_maps
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.choose_size import choose_size
-from mvseg.detection.find_leaves import PassResult
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
-from mvseg.pipeline.find_in_photos import colors_to_judge_by, judge_pass, run_pass, select_judges
+from mvseg.pipeline.find_in_photos import choose_size, colors_to_judge_by, run_pass, select_judges
 from mvseg.pipeline.open_scene import open_scene
-from mvseg.pipeline.plant import whole_photos
+from mvseg.pipeline.plant import Plant
 from mvseg.verification.leaf_scores import order_ratings
 
 
@@ -59,35 +57,34 @@ def sweep(folder: Path, cache: Path) -> tuple[float, float]:
     opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off"))
     few, views = select_judges(opened)
     truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
-    detections, detect = CachedDetections(cache), opened.config.detect
-    first = run_pass(few, detect, cache=detections)
-    boxes, colors = first.detected.boxes, colors_to_judge_by(few, first)
-    boxes = whole_photos(few.scene) if boxes is None else boxes
+    detections = CachedDetections(cache)
+    first = run_pass(few, None, cache=detections)
+    boxes, colors = first.boxes, colors_to_judge_by(first)
     scores: dict[int, float] = {}
 
-    def show(result: PassResult, begun: float) -> PassResult:
-        result, masks, size = judge_pass(few, result, colors), result.leaves.masks, result.detected.longest
+    def show(result: Plant, begun: float) -> Plant:
+        result, masks, size = replace(result, colors=colors), result.masks, result.image_size
         maps = None if truth is None else [truth[view] for view in views.tolist()]
         scores[size] = np.nan if maps is None else leaf_metrics(masks.regions, masks.instance_ids, maps).mv_pq
         area, seconds = result.rating.agreed_area / 1e6, time.process_time() - begun
-        cells = f"{result.rating.num_leaves} | {result.leaves.agreement:.2f} | {area:.3f}"
+        cells = f"{result.rating.num_leaves} | {result.agreement:.2f} | {area:.3f}"
         print(f"| {size} | {cells} | {result.rating.expected:.0f} | {scores[size]:.3f} | {seconds:.0f} |", flush=True)
         return result
 
-    def see(size: int) -> PassResult:
+    def see(size: int) -> Plant:
         begun = time.process_time()
-        return show(run_pass(few, replace(detect, image_size=size), cache=detections, boxes=boxes), begun)
+        return show(run_pass(few, size, cache=detections, boxes=boxes), begun)
 
     print(f"\n**{folder.resolve().name}**, {len(views)} photos\n")
     print("| px | leaves | agreement | agreed area, Mpx | E | MV-PQ | CPU s |\n" + "|---" * 7 + "|")
     results = [show(first, time.process_time())]
-    while (size := results[0].detected.longest * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
+    while (size := results[0].image_size * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
         results.append(see(round(size)))
-    by_size = {round(results[0].detected.longest * DETECTION.size_step**n): each for n, each in enumerate(results)}
+    by_size = {round(results[0].image_size * DETECTION.size_step**n): each for n, each in enumerate(results)}
     best = results[order_ratings([each.rating for each in results])[0]]
     searched = choose_size(by_size.__getitem__, results[0])[0]
     most = max(scores.values())
-    losses = [most - scores[each.detected.longest] for each in (best, searched)]
+    losses = [most - scores[each.image_size] for each in (best, searched)]
     print(f"\nlost over the whole range {losses[0]:.3f}, by the search {losses[1]:.3f}", flush=True)
     return losses[0], losses[1]
 

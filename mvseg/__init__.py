@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from mvseg.demo import demo_scene as demo_scene
     from mvseg.detection.assignment import EpipolarAssignment as EpipolarAssignment
     from mvseg.detection.config import DetectConfig as DetectConfig
-    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN as MultiViewMaskRCNN
     from mvseg.detection.nms import cluster_aware_nms as cluster_aware_nms
     from mvseg.detectors.zoo import load_detector as load_detector
     from mvseg.errors import InputError as InputError
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MatchReport as MatchReport
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
+    from mvseg.pipeline.mask_rcnn import MultiViewMaskRCNN as MultiViewMaskRCNN
     from mvseg.pipeline.run_scene import run_scene as run_scene
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
     from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces as fit_surfaces

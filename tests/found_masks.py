@@ -17,7 +17,7 @@ from mvseg.scene import Scene
 
 @dataclass(frozen=True, eq=False)
 class FoundMasks:
-    """As `mvseg.detection.find_leaves.Pass`."""
+    """As `mvseg.detection.detect_scene.Pass`."""
 
     sure: Matching
     excessive: Masks
@@ -42,7 +42,7 @@ class FoundMasks:
 
 def open_photos(scene: Scene, config: RunConfig = RunConfig(), given: Masks | None = None) -> Opened:
     """A scene in memory, as `open_scene` opens one."""
-    return Opened(scene, Photos(scene), given, mask_kind="", views_left_out=(), config=config)
+    return Opened(scene, Photos(scene), config, given=given)
 
 
 def see_masks(monkeypatch: Any, look: Any) -> None:

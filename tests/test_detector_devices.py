@@ -127,11 +127,12 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
 
-    def choose(proposals: Masks, matched: list[Masks], judges: Judges) -> Leaves:
-        assert {each.device.type for each in (judges.cameras.K, matched[0].view_index, proposals.view_index)} == {"cpu"}
-        return Leaves.of(proposals)
+    def choose(proposals: Masks, matched: dict[str, Masks], judges: Judges, **_: object) -> Leaves:
+        tables = [proposals, *matched.values()]
+        assert {each.device.type for each in (judges.cameras.K, *(table.view_index for table in tables))} == {"cpu"}
+        return Leaves(proposals, surfaces={}, probabilities={}, rejected=(), keys={})
 
-    monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
+    monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
     results = wrapped(photos, cameras=CAMERAS)
     with other_device() as device:
         answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))

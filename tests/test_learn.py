@@ -176,7 +176,6 @@ def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
     monkeypatch.setattr(module, "_describe", lambda *_: "the same")
     monkeypatch.setattr(module, "_at_size", lambda path, _: path.read_bytes())
     monkeypatch.setattr(module, "run_near", lambda *_, **__: plant)
-    monkeypatch.setattr(module, "plant_of_pass", lambda *_, **__: plant)
     for _ in range(2):
         seen = learn(lower(plant, 0.5), cache=CachedDetections(tmp_path / "kept"))
         assert seen.learned.weights == b"weights"

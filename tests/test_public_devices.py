@@ -112,7 +112,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "LeafSurface": (lambda r, c, i: surfaces()[1].project(c)[0], True),
     "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),
     "choose_leaves": (
-        lambda r, c, i: choose_leaves(found := detected(r, i), [found], Judges(c.to("cpu"))).masks.instance_ids, False
+        lambda r, c, i: choose_leaves(m := detected(r, i), {"matched": m}, Judges(c.to("cpu"))).probabilities, False
     ),
     "snap_masks": (lambda r, c, i: snap_masks(detected(r, i), grey_photos(c)).instance_ids, False),
     "list_mask_questions": (lambda r, c, i: len(list_mask_questions(masks_of(r, i), surfaces(), cameras=c)), False),

@@ -13,7 +13,6 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
 from mvseg.scene import Cameras
 from mvseg.verification.choose import Edited, Judges, choose_leaves, find_again
 
@@ -36,7 +35,7 @@ def verify_ids(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvseg.verification.choose.fit_surfaces", fit)
-        judges = Judges(cameras.to("cpu"), holds=True, cache=SurfaceCache())
+        judges = Judges(cameras.to("cpu"), holds=True, cache={})
         again = find_again(masks.to("cpu"), judges, config)
-        tables = [each for each in (masks, again) if each is not None]
+        tables = {"matched": masks} | ({} if again is None else {"matched again": again})
         return choose_leaves(masks, tables, judges, edited=edited).masks

@@ -32,6 +32,7 @@ def run_heads(
     nms_thresh: float | None = None,
     detections_per_img: int | None = None,
     num_growths: int = 0,
+    image_size: int | None = None,
 ) -> dict[str, Tensor]:
     """Run the heads of a detector on one photo, before anything is scaled back to the photo. Under autocast the
     backbone may work in half precision; the coordinates of boxes may not, so that everything behind it runs in the
@@ -44,6 +45,7 @@ def run_heads(
         detections_per_img: so many of the best scores are kept; None for the model's own.
         num_growths: how often boxes grow where masks touch their sides, see `grow_boxes`; those that score less than
             the model's threshold, once masks are cut, are gone then.
+        image_size: longer side, pixels, that the photo is scaled to; None: as the model does.
 
     Returns:
         The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
@@ -57,6 +59,8 @@ def run_heads(
         heads.detections_per_img = detections_per_img
     frame = copy.copy(model.transform)
     frame.normalize = partial(normalize, frame)
+    if image_size is not None:
+        frame.min_size, frame.max_size = (image_size,), image_size
     resized, _ = frame([photo])
     features = model.backbone(resized.tensors)
     if isinstance(features, Tensor):

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import os
 import posixpath
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 
 import numpy as np
 import pycolmap
@@ -258,15 +259,16 @@ class Photos:
     to. `exist` is true if there are photos; all of them or none, see `check_photos`.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, cached: Mapping[int, np.ndarray] = MappingProxyType({})) -> None:
+        """`cached`: {view: photo}, those in memory; files are not read for these."""
         self.scene = scene
-        self._cached: dict[int, np.ndarray] = {}
+        self._cached = dict(cached)
         self._contents: dict[int, PhotoContent] = {}
         self._hashes: dict[int, str] = {}
 
     @property
     def exist(self) -> bool:
-        return self.scene.views[0].path.is_file()
+        return bool(self._cached) or self.scene.views[0].path.is_file()
 
     def __call__(self, view: int) -> np.ndarray:
         photo = self._cached.get(view)

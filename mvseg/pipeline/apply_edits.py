@@ -40,13 +40,12 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     masks, done = apply_everywhere(corrected, edited.masks)
     if len(editable) and not len(masks):
         warn(Finding("no_leaf_left"))
-    if not opened.holds or opened.config.reconstruct is not None:
+    if opened.photos.exist and (not opened.holds or opened.config.reconstruct is not None):
         with timed("follow"):
-            photos = opened.photos if opened.photos.exist else None
-            colors = plant.leaf_colors if photos is not None and plant.matching.num_instances else None
-            masks = follow_drawn(masks, cameras=cameras, photos=photos, colors=colors, cache=opened.surfaces)
+            colors = plant.leaf_colors if plant.matching.num_instances else None
+            masks = follow_drawn(masks, cameras=cameras, photos=opened.photos, colors=colors, cache=opened.cache)
     said = _gather_said(plant, corrected, stays, masks)
-    return replace(edited, edits=done.fates, refused=done.refused).choose(said, drawn=plant.drawn)
+    return replace(edited, edits=done.fates, refused=done.refused).choose(said)
 
 
 def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[Plant, Tensor]:

@@ -20,7 +20,7 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.open_scene import Opened
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
-from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache
+from mvseg.reconstruction.surface.surface_cache import ORIENTED, Approach
 from mvseg.regions import Regions
 from mvseg.results.result import Instances
 from mvseg.verification.choose import RejectedCandidate
@@ -44,9 +44,7 @@ def pack_plant(plant: Plant, findings: Sequence[Finding]) -> bytes | None:
         {
             "views": opened.names,
             "plant": {name: getattr(plant, name) for name in FIELDS},
-            "approaches": opened.surfaces.approaches,
-            "surfaces": opened.surfaces.surfaces,
-            "snapped": {name: torch.from_numpy(each) for name, each in opened.snapped.items()},
+            "cache": {name: each for name, each in opened.cache.items() if not name.startswith(ORIENTED)},
             "said": list(findings),
         },
         packed,
@@ -68,9 +66,6 @@ def unpack_plant(content: bytes, opened: Opened) -> tuple[Plant, list[Finding]] 
             packed = torch.load(io.BytesIO(inflated), map_location="cpu", weights_only=True)
         if packed["views"] != opened.names:
             return None
-        surfaces = SurfaceCache(packed["approaches"], packed["surfaces"])
-        snapped = {name: each.numpy() for name, each in packed["snapped"].items()}
-        opened = replace(opened, surfaces=surfaces, snapped=snapped)
-        return Plant(opened=opened, **packed["plant"]), packed["said"]
+        return Plant(opened=replace(opened, cache=packed["cache"]), **packed["plant"]), packed["said"]
     except Exception:  # zlib and torch raise many kinds at broken files
         return None

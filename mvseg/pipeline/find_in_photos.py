@@ -1,33 +1,33 @@
-"""Leaves in the photos: the detector looks, at the size at which the views agree best, and the views choose."""
+"""Leaves in the photos: the detector looks, at the size at which the views agree best, and the views choose.
+
+A detector knows leaves of some sizes in pixels. Scores do not reveal which sizes work on a new plant; agreement between
+views does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md). Not in the
+paper.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Bools
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.choose_size import choose_near, choose_size, order_sizes
-from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
-from mvseg.detection.find_leaves import PassResult, find_leaves
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
-from mvseg.matching.result import Matching
 from mvseg.pipeline.open_scene import Opened
-from mvseg.pipeline.plant import Plant, hold_matched, whole_photos
+from mvseg.pipeline.plant import Plant, make_plant, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.verification.leaf_color import colored_shares
-from mvseg.verification.numbers import CHOICE
-from mvseg.verification.picture import colors_of_leaves, is_familiar
-
-Colors = NDArray[np.bool_]  # of leaves, see `leaf_colors`
+from mvseg.verification.leaf_scores import order_ratings
+from mvseg.verification.numbers import CHOICE, COLORS
+from mvseg.verification.picture import is_familiar
 
 
 def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> Plant:
@@ -37,44 +37,41 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     leaves of a species that the detector knows. Of twice as many photos as `DETECTION.judging_views`, or more, so many
     choose the size, or the two between which all photos choose. All sizes are of the parts that the first pass chose.
     """
-    detect = opened.config.detect
-    if detect.image_size is not None or opened.holds:
-        return plant_of_pass(opened, run_pass(opened, detect, cache=cache))
+    size = opened.config.detect.image_size
+    if size is not None or opened.holds:
+        return announce(run_pass(opened, size, cache=cache))
     few, views = select_judges(opened)
-    first = run_pass(few, detect, cache=cache)
-    colors, parts = colors_to_judge_by(few, first), first.detected.boxes
-    first = judge_pass(few, first, colors)
-    boxes = whole_photos(few.scene) if parts is None else parts
-    is_clear = first.leaves.agreement >= DETECTION.clear_agreement
-    best = [first]
-    if not (is_clear and is_familiar(first.leaves.masks, sure_score=DETECTION.sure_score)):
-        best = choose_size(partial(run_at, few, detect, colors=colors, cache=cache, boxes=boxes), first)
+    first = run_pass(few, None, cache=cache)
+    boxes, colors, cameras = first.boxes, colors_to_judge_by(first), opened.scene.cameras
+    first = replace(first, colors=colors)
+    best, is_clear = [first], first.agreement >= DETECTION.clear_agreement
+    if not (is_clear and is_familiar(first.masks, sure_score=DETECTION.sure_score)):
+        best = choose_size(partial(run_pass, few, cache=cache, boxes=boxes, colors=colors), first)
     if few is opened:
-        return plant_of_pass(opened, best[0])
-    boxes = whole_photos(opened.scene)
-    if parts is not None:
-        masks, cameras = first.detected.sure.masks, opened.scene.cameras
+        return announce(best[0])
+    if torch.equal(boxes, whole_photos(few.scene)):
+        boxes = whole_photos(opened.scene)
+    else:
+        masks = first.matched["matched"]
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
     if best[0] is first:  # a species that the detector knows: no other size is worth a pass over all photos
-        return plant_of_pass(opened, run_pass(opened, detect, cache=cache, boxes=boxes))
-    sizes = [None if each is first else each.detected.longest for each in best]
-    results = [run_at(opened, detect, size, colors=colors, cache=cache, boxes=boxes) for size in sizes]
-    return plant_of_pass(opened, order_sizes(results)[0])
+        return announce(run_pass(opened, None, cache=cache, boxes=boxes))
+    run = partial(run_pass, opened, cache=cache, boxes=boxes, colors=colors)
+    return announce(order_sizes([run(None if each is first else each.image_size) for each in best])[0])
 
 
-def colors_to_judge_by(opened: Opened, first: PassResult) -> Colors | None:
-    """Leaf colours of the first pass, which may miss leaves but finds little else; None where it has too few leaves."""
-    masks = first.leaves.masks
-    is_known = opened.photos.exist and masks.num_instances >= CHOICE.least_leaves
-    return colors_of_leaves(masks, opened.photos) if is_known else None
+def announce(plant: Plant) -> Plant:
+    """Warn of the findings of the pass that was selected."""
+    for finding in plant.findings:
+        warn(finding)
+    return replace(plant, colors=None, findings=())
 
 
-def judge_pass(opened: Opened, result: PassResult, colors: Colors | None) -> PassResult:
-    """The same with the share of leaf colour in each mask, by which passes are compared."""
-    if colors is None:
-        return result
-    return replace(result, colored=colored_shares(result.leaves.masks, opened.photos, colors))
+def colors_to_judge_by(first: Plant) -> Bools:
+    """Leaf colours of the first pass, which may miss leaves but finds little else; all where it has too few leaves."""
+    is_known = first.opened.photos.exist and first.masks.num_instances >= CHOICE.least_leaves
+    return first.leaf_colors if is_known else np.ones((COLORS.bins,) * 3, bool)
 
 
 def select_judges(opened: Opened) -> tuple[Opened, Tensor]:
@@ -87,66 +84,72 @@ def select_judges(opened: Opened) -> tuple[Opened, Tensor]:
     return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
 
 
-def run_near(plant: Plant, detect: DetectConfig, *, cache: CachedDetections | None) -> PassResult:
+def choose_size(see: Callable[[int], Plant], first: Plant) -> list[Plant]:
+    """Look again and again at a smaller size, as long as the agreed area grows; return one pass, or two, see
+    `order_sizes`.
+
+    Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), it takes more sizes
+    without growth (`DETECTION.patience`): there, agreed areas of neighbouring sizes differ by chance.
+
+    Args:
+        see: finds leaves at a size: the longer side, pixels, that photos are scaled to.
+        first: the pass at the usual size.
+    """
+    results, size, num_misses = [first], float(first.image_size), 0
+    while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
+        best = order_sizes(results)[0]
+        results.append(see(round(size)))
+        num_misses = 0 if order_sizes(results)[0] is results[-1] else num_misses + 1
+        if num_misses > (0 if best.agreement >= DETECTION.clear_agreement else DETECTION.patience):
+            break
+    return order_sizes(results)
+
+
+def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> list[Plant]:
+    """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
+    `most`: the longer side of the photos, pixels. Returns as `choose_size`."""
+    larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
+    sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
+    return order_sizes([see(each) for each in sizes])
+
+
+def order_sizes(results: Sequence[Plant]) -> list[Plant]:
+    """The best pass, see `order_ratings`. Then the second best, if its agreed area is at least `DETECTION.as_good`
+    times as large: the caller decides between the two by all views."""
+    first, *others = [results[index] for index in order_ratings([each.rating for each in results])]
+    least = DETECTION.as_good * first.rating.agreed_area
+    return [first, *(each for each in others[:1] if first.rating.agreed_area >= each.rating.agreed_area >= least)]
+
+
+def run_near(plant: Plant, *, cache: CachedDetections | None) -> Plant:
     """Run taught weights at the size that they have learned at, and at the sizes next to it, see `choose_near`; only at
     `DetectConfig.image_size`, where it is given."""
-    opened, boxes = plant.opened, plant.boxes
-    if detect.image_size is not None:
-        return run_pass(opened, detect, cache=cache, boxes=boxes)
-    run = partial(run_at, colors=plant.leaf_colors if opened.photos.exist else None, cache=cache)
+    opened, boxes, size = plant.opened, plant.boxes, plant.opened.config.detect.image_size
+    if size is not None:
+        return run_pass(opened, size, cache=cache, boxes=boxes)
     few, views = select_judges(opened)
-    results = choose_near(partial(run, few, detect, boxes=boxes[views]), plant.image_size, most=plant.longest_side)
+    run = partial(run_pass, cache=cache, colors=plant.leaf_colors)
+    results = choose_near(partial(run, few, boxes=boxes[views]), plant.image_size, most=plant.longest_side)
     if few is opened:
         return results[0]
-    return order_sizes([run(opened, detect, each.detected.longest, boxes=boxes) for each in results])[0]
-
-
-def run_at(
-    opened: Opened,
-    detect: DetectConfig,
-    size: int | None,
-    *,
-    colors: Colors | None,
-    cache: CachedDetections | None,
-    boxes: Tensor,
-) -> PassResult:
-    """Run the detector at a size, see `run_pass`, to compare the pass with others, see `judge_pass`."""
-    return judge_pass(opened, run_pass(opened, replace(detect, image_size=size), cache=cache, boxes=boxes), colors)
+    return order_sizes([run(opened, each.image_size, boxes=boxes) for each in results])[0]
 
 
 def run_pass(
     opened: Opened,
-    detect: DetectConfig,
+    size: int | None,
     *,
     cache: CachedDetections | None,
     boxes: Tensor | None = None,
-) -> PassResult:
-    """Run the detector once over all views; the result holds its warnings, as it may be thrown away."""
+    colors: Bools | None = None,
+) -> Plant:
+    """Run the detector once over all views, at a size, see `DetectConfig.image_size`; the plant holds its warnings, as
+    it may be thrown away. `colors`: of leaves, by which it is compared with other passes."""
+    detect = replace(opened.config.detect, image_size=size)
     with collect_warnings() as findings:
-        detected = detect_scene(opened.photos, detect, match=opened.config.match, cache=cache, boxes=boxes)
-        photos = opened.photos if opened.photos.exist else None
-        result = find_leaves(detected, opened.scene.cameras, config=detect, photos=photos, cache=opened.surfaces)
-    return replace(result, findings=tuple(findings))
-
-
-def plant_of_pass(opened: Opened, result: PassResult) -> Plant:
-    """Make a plant of the pass that was selected; warn of its findings."""
-    for finding in result.findings:
-        warn(finding)
-    detected = result.detected
-    if not len(detected.sure):
-        warn(Finding("nothing_detected", values={"score": opened.config.detect.min_score}))
-    matching = Matching(result.matched[0], detected.sure.report)
-    boxes = whole_photos(opened.scene) if detected.boxes is None else detected.boxes
-    if opened.holds:
-        return hold_matched(opened, matching, image_size=detected.longest, boxes=boxes)
-    plant = Plant(
-        opened=opened,
-        matching=matching,
-        proposals=result.proposals,
-        matched=result.matched,
-        image_size=detected.longest,
-        boxes=boxes,
-        disagreement=opened.find_disagreement(matching),
-    )
-    return plant.with_leaves(result.leaves)
+        match, proposer = opened.config.match, opened.proposer
+        detected = detect_scene(opened.photos, detect, match=match, cache=cache, boxes=boxes, proposer=proposer)
+        plant = make_plant(opened, detected.sure, detected)
+        if not len(detected.sure):
+            warn(Finding("nothing_detected", values={"score": detect.min_score}))
+    return replace(plant, findings=tuple(findings), colors=colors)

@@ -63,6 +63,7 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         views_left_out=opened.views_left_out,
         fates=fates,
         learned=plant.learned,
+        inputs={str(path.resolve()): sha256 for path, sha256 in opened.inputs.items()},
     )
 
 
@@ -96,7 +97,7 @@ def complete_masks(plant: Plant) -> Plant:
     masks, photos = plant.masks.to("cpu"), plant.opened.photos
     with timed("snap"):
         missing = find_missing_parts(masks, plant.instances.starts, photos, cameras=plant.scene.cameras)
-        return plant.with_masks(snap_masks(masks, photos, missing=missing, cache=plant.opened.snapped))
+        return plant.with_masks(snap_masks(masks, photos, missing=missing, cache=plant.opened.cache))
 
 
 def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -> dict[int, LeafSurface]:
@@ -110,7 +111,7 @@ def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -
             plant.scene.cameras,
             starts=plant.instances.starts,
             same_segmenter=same_segmenter,
-            cache=plant.opened.surfaces,
+            cache=plant.opened.cache,
         )
 
 

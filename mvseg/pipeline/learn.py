@@ -25,7 +25,7 @@ from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.find_in_photos import plant_of_pass, run_near
+from mvseg.pipeline.find_in_photos import run_near
 from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
@@ -75,7 +75,7 @@ def learn(
                 report_step("the detector learns this species from the views; Ctrl-C keeps what is found")
             report_step(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             taught = _learn_once(best, labels, cache)
-            before, after = best.rating, taught.rate_by(best)
+            before, after = best.rating, replace(taught, colors=best.leaf_colors).rating
             areas.append(after.agreed_area)
             is_better = order_ratings([before, after])[0] == 1 and after.agreed_area >= GROWTH * before.agreed_area
             if rounds is None and not is_better:
@@ -117,11 +117,10 @@ def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Pl
             content = _fine_tune(plant, labels)
             path.parent.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda partial: partial.write_bytes(content))
-    detect = replace(opened.config.detect, weights=str(path))
-    found = run_near(plant, detect, cache=cache)
-    with collect_warnings():
-        seen = plant_of_pass(opened, found)
-    return replace(seen, learned=Learned(weights=_at_size(path, seen.image_size)))
+    config = replace(opened.config, detect=replace(opened.config.detect, weights=str(path)))
+    taught = run_near(replace(plant, opened=replace(opened, config=config)), cache=cache)
+    learned = Learned(weights=_at_size(path, taught.image_size))
+    return replace(taught, opened=opened, learned=learned, colors=None, findings=())
 
 
 def _at_size(path: Path, size: int) -> bytes:

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.config import ENOUGH_VIEWS, RunConfig
@@ -25,12 +23,15 @@ from mvseg.masks import STEM_CLASS, Masks
 from mvseg.matching.match import check_baselines, find_disagreement
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.spread_views import find_repeated, spread_views
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
+from mvseg.reconstruction.surface.surface_cache import Cache
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import timed
 from mvseg.traits.up import place_scene
 from mvseg.verification.choose import Judges
+
+if TYPE_CHECKING:  # loads torchvision
+    from mvseg.detection.proposals import Proposer
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,19 +43,20 @@ class Opened:
         given: their masks, matched to nothing; None: a detector is to find them.
         mask_kind: source of those ("COCO", "label images", ...); "" without any.
         views_left_out: names of the other views.
-        inputs: {file or folder: SHA-256 as it was read} of cameras and masks, or of the detector's weights.
-        snapped: see `snap_masks`.
+        inputs: {file or folder: SHA-256 as it was read} of cameras, masks, or the detector's weights, and edits.
+        cache: of surfaces and snapped edges, see `fit_surfaces` and `snap_masks`.
+        proposer: with the detector that looks; None: the one whose weights `config` names.
     """
 
     scene: Scene
     photos: Photos
-    given: Masks | None
-    mask_kind: str
-    views_left_out: tuple[str, ...]
     config: RunConfig
+    given: Masks | None = None
+    mask_kind: str = ""
+    views_left_out: tuple[str, ...] = ()
     inputs: Mapping[Path, str] = field(default_factory=dict)
-    surfaces: SurfaceCache = field(default_factory=SurfaceCache)
-    snapped: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    cache: Cache = field(default_factory=dict)
+    proposer: Proposer | None = None
 
     @property
     def names(self) -> list[str]:
@@ -80,7 +82,7 @@ class Opened:
             holds=self.holds,
             photos=self.photos if self.photos.exist and not self.holds else None,
             min_probability=detect.min_probability,
-            cache=self.surfaces,
+            cache=self.cache,
         )
 
 
@@ -99,7 +101,8 @@ def open_scene(
         folder, masks = Path(folder), None if masks is None else Path(masks)
         before = {} if masks is None else {masks: _hash_masks(masks)}
         loaded = load_scene(folder)
-        inputs = before | ({} if loaded.source is None else {loaded.source: hash_files(loaded.source)})
+        files = [loaded.source, None if corrections is None else corrections.source]
+        inputs = before | {path: hash_files(path) for path in files if path is not None}
         photos = Photos(loaded)
         whole = place_scene(loaded, photos, scale=config.scale, unit=config.unit, up=config.up)
         once = masks is None or config.views != "all"
@@ -114,7 +117,7 @@ def open_scene(
         if masks is None:
             require_photos(scene, folder)
             inputs |= _hash_weights(config)
-            return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config, inputs=inputs)
+            return Opened(scene, photos, config, views_left_out=left_out, inputs=inputs)
         mask_files = recognise_masks(whole, masks)
         names = [config.category_names, *([[config.stem_category]] if config.stem_category is not None else [])]
         regions = [read_masks(whole, mask_files, crowd=config.coco_crowd, categories=each) for each in names]
@@ -130,9 +133,8 @@ def open_scene(
         for stems in parts[1:]:
             both = Masks.concatenate((given, Masks.of(stems, classes=torch.full((len(stems),), STEM_CLASS))))
             given = both.select(both.view_index.argsort(stable=True))
-        return Opened(
-            scene, photos, given, mask_kind=mask_files.kind, views_left_out=left_out, config=config, inputs=inputs
-        )
+        kind = mask_files.kind
+        return Opened(scene, photos, config, given=given, mask_kind=kind, views_left_out=left_out, inputs=inputs)
 
 
 def _hash_masks(masks: Path) -> str:

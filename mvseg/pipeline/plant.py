@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.arrays import Bools
 from mvseg.corrections.corrected import Fate, RejectedPixel
+from mvseg.detection.numbers import DETECTION
+from mvseg.errors import collect_warnings
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.match import match_masks
@@ -21,11 +23,13 @@ from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
 from mvseg.verification.candidates import Key
-from mvseg.verification.choose import Edited, Leaves, RejectedCandidate, add_beside, choose_leaves, find_again
-from mvseg.verification.evidence import Drawn, draw_views
+from mvseg.verification.choose import Edited, RejectedCandidate, add_beside, choose_leaves, find_again
 from mvseg.verification.leaf_color import colored_shares
 from mvseg.verification.leaf_scores import Rating, rate_pass
 from mvseg.verification.picture import colors_of_leaves
+
+if TYPE_CHECKING:  # loads torchvision
+    from mvseg.detection.detect_scene import Pass
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +41,7 @@ class Plant:
     Attributes:
         matching: D masks with their ids, and a report on the scene.
         proposals: R masks on the CPU, the excessive set of the detector, or the given masks.
-        matched: tables of matched proposals, the sure ones first.
+        matched: {source of candidates: table of matched proposals}, see `SOURCES`.
         image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
         instances: initial surfaces (`starts`) and probabilities of the leaves.
@@ -45,12 +49,14 @@ class Plant:
         keys: {instance id: key of the candidate that it was}.
         refused: pixels without a mask where the user says that no leaf is.
         disagreement: finding on views that disagree about the masks, see `find_disagreement`; None: they agree.
+        colors: of leaves, by which the plant is rated; None: its own.
+        findings: of the pass that found it, to warn of if it stays.
     """
 
     opened: Opened
     matching: Matching
     proposals: Masks
-    matched: tuple[Masks, ...]
+    matched: Mapping[str, Masks]
     image_size: int
     boxes: Tensor
     instances: Instances = field(default_factory=Instances)
@@ -61,6 +67,8 @@ class Plant:
     refused: tuple[RejectedPixel, ...] = ()
     learned: Learned = NOTHING_LEARNED
     disagreement: Finding | None = None
+    colors: Bools | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def scene(self) -> Scene:
@@ -74,14 +82,11 @@ class Plant:
 
     @cached_property
     def rating(self) -> Rating:
-        """See `rate_pass`; by the leaf colours of the plant itself."""
-        return self.rate_by(self)
-
-    def rate_by(self, other: Plant) -> Rating:
-        """Rate by the leaf colours of the same plant, seen another time."""
+        """See `rate_pass`."""
         masks, photos = self.masks.to("cpu"), self.opened.photos
-        colored = colored_shares(masks, photos, other.leaf_colors) if photos.exist else None
-        pixel = self.longest_side / self.image_size
+        colored, pixel = None, self.longest_side / self.image_size
+        if photos.exist:
+            colored = colored_shares(masks, photos, self.leaf_colors if self.colors is None else self.colors)
         return rate_pass(masks, self.instances.probabilities, pixel=pixel, colored=colored)
 
     @property
@@ -93,7 +98,7 @@ class Plant:
     def editable(self) -> Masks:
         """Masks that the user sees and edits: given masks, or accepted ones and, beside them, sure detections that show
         something else."""
-        return self.masks if self.opened.holds else add_beside(self.masks, self.matched[0], self.scene.cameras)
+        return self.masks if self.opened.holds else add_beside(self.masks, self.matched["matched"], self.scene.cameras)
 
     def ids_of(self, masks: Masks) -> Tensor:
         """(D,) int64, the leaf that each mask of a later table showed here: -1 for none, and for masks made since."""
@@ -102,17 +107,7 @@ class Plant:
         return ids[masks.proposal.cpu().clamp(min=-1)]  # the last one is -1
 
     @cached_property
-    def drawn(self) -> tuple[Drawn, ...]:
-        """V views of the proposals, see `draw_views`."""
-        judges = self.opened.judges
-        return draw_views(self.proposals.regions, (), judges.cameras, photos=judges.photos)
-
-    def draw_ahead(self) -> None:
-        """Compute in advance what all edits of detected masks begin with."""
-        _ = self.editable, [each.is_shared for each in self.drawn]
-
-    @cached_property
-    def leaf_colors(self) -> NDArray[np.bool_]:
+    def leaf_colors(self) -> Bools:
         """The colours of leaves, see `colors_of_leaves`."""
         return colors_of_leaves(self.masks.to("cpu"), self.opened.photos)
 
@@ -120,17 +115,13 @@ class Plant:
         """The same with other masks of the same leaves."""
         return replace(self, matching=self.matching.with_masks(masks))
 
-    def with_leaves(self, leaves: Leaves) -> Plant:
-        """The same with the leaves that were chosen."""
+    def choose(self, edited: Edited | None = None) -> Plant:
+        """Choose leaves, see `choose_leaves`."""
+        with timed("choose"):
+            leaves = choose_leaves(self.proposals, self.matched, self.opened.judges, edited=edited)
         instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
         chosen = replace(self, instances=instances, rejected=leaves.rejected, agreement=leaves.agreement)
         return replace(chosen, keys=leaves.keys).with_masks(leaves.masks)
-
-    def choose(self, edited: Edited | None = None, *, drawn: Sequence[Drawn] = ()) -> Plant:
-        """Choose leaves, see `choose_leaves`."""
-        with timed("choose"):
-            leaves = choose_leaves(self.proposals, self.matched, self.opened.judges, edited=edited, drawn=drawn)
-        return self.with_leaves(leaves)
 
 
 def match_given(opened: Opened) -> Plant:
@@ -139,28 +130,54 @@ def match_given(opened: Opened) -> Plant:
     assert given is not None, "expected a scene with masks"
     with timed("match"):
         matching = match_masks(given, opened.scene.cameras, config=opened.config.match)
-    return hold_matched(opened, matching)
+    return make_plant(opened, matching)
 
 
-def hold_matched(
-    opened: Opened, matching: Matching, *, image_size: int | None = None, boxes: Tensor | None = None
-) -> Plant:
-    """A plant of masks that are held to what they were matched to, unless surfaces say otherwise."""
-    boxes = whole_photos(opened.scene) if boxes is None else boxes
-    masks = matching.masks.to("cpu")
-    masks = replace(masks, proposal=torch.arange(len(masks)))
-    with timed("choose"):
-        again = find_again(masks, opened.judges, opened.config.match)
+def make_plant(opened: Opened, matching: Matching, detected: Pass | None = None) -> Plant:
+    """A plant whose leaves the views choose, of the candidates of all `SOURCES`.
+
+    `detected`: the pass whose sure proposals were matched. Without one, and where masks are held to what they were
+    matched to, the masks of the matching are all proposals."""
+    masks, frames = matching.masks.to("cpu"), whole_photos(opened.scene)
+    if opened.holds or detected is None:
+        masks = replace(masks, proposal=torch.arange(len(masks)))
+    boxes = frames if detected is None or detected.boxes is None else detected.boxes
     plant = Plant(
         opened=opened,
-        matching=matching,
-        proposals=masks,
-        matched=(masks,) if again is None else (masks, again),
-        image_size=int(boxes.max()) if image_size is None else image_size,
+        matching=matching.with_masks(masks),
+        proposals=masks if opened.holds or detected is None else detected.proposals(),
+        matched={},
+        image_size=int(boxes.max()) if detected is None else detected.longest,
         boxes=boxes,
         disagreement=opened.find_disagreement(matching),
     )
-    return plant.choose()
+    tables = {name: source(plant, detected) for name, source in SOURCES.items()}
+    return replace(plant, matched={name: each for name, each in tables.items() if each is not None}).choose()
+
+
+def match_more(plant: Plant, detected: Pass | None) -> Masks | None:
+    """Weak proposals of a detector, matched with the sure ones."""
+    if detected is None or plant.opened.holds:
+        return None
+    with collect_warnings():  # of the sure ones already
+        return detected.match(min(DETECTION.more_score, plant.opened.config.detect.min_score)).masks
+
+
+def match_freed(plant: Plant, _: Pass | None) -> Masks | None:
+    """Held masks that do not show their own leaf, matched again, see `find_again`."""
+    if not plant.opened.holds:
+        return None
+    with timed("choose"):
+        return find_again(plant.masks, plant.opened.judges, plant.opened.config.match)
+
+
+# Each gives proposals with ids of their own. Instances that an earlier one has, by name, are not added again, so that
+# the order does not matter. The masks that "matched" gives are there without any other source; edits are one more.
+SOURCES: dict[str, Callable[[Plant, Pass | None], Masks | None]] = {
+    "matched": lambda plant, _: plant.masks,
+    "matched again": match_freed,
+    "matched more": match_more,
+}
 
 
 def whole_photos(scene: Scene) -> Tensor:

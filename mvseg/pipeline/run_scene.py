@@ -22,7 +22,6 @@ from mvseg.pipeline.finish import check_result, measure, shape_leaves
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import match_given
 from mvseg.results.result import Result
-from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 
 
@@ -54,8 +53,6 @@ def run_scene(
     """
     if isinstance(corrections, Path | str):
         corrections = load_corrections(corrections)
-    edits = None if corrections is None else corrections.source
-    read = {} if edits is None else {edits: hash_files(edits)}
     with note_warnings() as noticed, running() as now, TemporaryDirectory() as place:
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
@@ -79,7 +76,5 @@ def run_scene(
         result = check_result(result, edited)
         result = measure(result, config)
         packed = pack_plant(plant, findings_before)
-    inputs = {str(path.resolve()): sha256 for path, sha256 in {**opened.inputs, **read}.items()}
     findings = keep_causes((*noticed, *result.findings))
-    result = replace(result, findings=findings, corrections=corrections, before_edits=packed)
-    return replace(result, seconds=now.seconds, inputs=inputs)
+    return replace(result, findings=findings, corrections=corrections, before_edits=packed, seconds=now.seconds)

@@ -120,7 +120,7 @@ class OpenResult:
         self._newest = result, pictures
         yield Update(news, outcomes, vanished + messages)
         if not self.opened.holds:
-            self._now[0].draw_ahead()
+            _ = self._now[0].editable  # all edits begin with it
 
     @cached_property
     def _saved_page(self) -> tuple[Result, list[Picture]]:

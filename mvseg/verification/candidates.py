@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.arrays import Bools, Floats, Ints
@@ -28,13 +29,13 @@ class Candidates:
         surfaces: K, None where the masks of one agree on none.
         matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
         stem: (K,) probability that it is a stem, see `stem_chances`; 0 without a surface.
-        source: (K,) int64, number of the matching that it comes from.
+        source: (K,) str, name of the matching that it comes from.
     """
 
     surfaces: tuple[LeafSurface | None, ...]
     matched: Floats
     stem: Floats
-    source: Ints
+    source: NDArray[np.str_]
 
     def __len__(self) -> int:
         return len(self.surfaces)
@@ -74,7 +75,7 @@ class Candidates:
         """(K,) median IoU of the surfaces with the masks that they were fitted to; 0.5 for none."""
         return np.array([0.5 if each is None else float(each.iou.nanmedian()) for each in self.surfaces], float)
 
-    def of_rows(self, source: int) -> Ints:
+    def of_rows(self, source: str) -> Ints:
         """(D,) the candidate of one matching that has each mask, -1 for none."""
         own = np.full(len(self.matched), -1)
         for index in np.flatnonzero(self.source == source).tolist():
@@ -82,39 +83,33 @@ class Candidates:
         return own
 
 
-def gather_candidates(
-    matched: Sequence[Masks],
-    table: Masks,
-    fit: Fit | None,
-) -> Candidates:
-    """The instances of each matching, once each.
+def gather_candidates(matched: Mapping[str, Masks], table: Masks, fit: Fit | None) -> Candidates:
+    """The instances of each matching, once each: of two that are nearly the same (`CHOICE.same`) the first one stays,
+    by the name of its source.
 
     Args:
-        matched: masks of each matching; their `proposal` is their row in the `table`.
+        matched: {source: masks}; their `proposal` is their row in the `table`.
         fit: {instance id: surface} to instances of masks; None: no surfaces.
     """
     areas = table.regions.areas.double()
     shapes: list[LeafSurface | None] = []
     members: list[Tensor] = []  # rows of the table, of each candidate
-    columns, source = [], []
-    for number, masks in enumerate(matched):
+    source = list[str]()
+    scores = np.full((len(table), sum(each.num_instances for each in matched.values())), np.nan)
+    for name, masks in sorted(matched.items()):
         ids, rows = masks.instance_ids, masks.proposal
         new = [each for each in ids[ids > 0].unique().tolist() if not _is_there(rows[ids == each], members, areas)]
         is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
         fitted = {} if fit is None else fit(replace(masks, instance_ids=ids.where(is_new, -1)))
         for each in new:
-            own = ids == each
-            members.append(rows[own])
             surface = fitted.get(each)
             shapes.append(surface if surface is not None and surface.exists else None)
-            columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))
-            columns[-1][members[-1]] = masks.match_scores[own].double()
-            source.append(number)
-    if not columns:
-        return Candidates((), np.zeros((len(table), 0)), np.zeros(0), np.zeros(0, np.int64))
+            members.append(rows[ids == each])
+            scores[members[-1].numpy(), len(source)] = masks.match_scores[ids == each]
+            source.append(name)
     chances = stem_chances({number: each for number, each in enumerate(shapes) if each is not None})
     stem = np.array([chances.get(number, 0.0) for number in range(len(shapes))])
-    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), stem, np.array(source))
+    return Candidates(tuple(shapes), scores[:, : len(source)], stem, np.array(source, str))
 
 
 def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:

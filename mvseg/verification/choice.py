@@ -25,6 +25,8 @@ from mvseg.verification.leaf_scores import (
 from mvseg.verification.mask_colors import MaskColors
 from mvseg.verification.numbers import CHOICE
 
+EDITED = "edited"  # definition: source of candidates that edits made
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -119,7 +121,7 @@ def choose(
     """Choose leaves, and their masks of the table (D masks): in rounds, as the leaves of one hide those behind them in
     the next. Given masks are as if a detector had found them, with a score of `CHOICE.given`."""
     rows = Rows.none(len(table), len(candidates)) if rows is None else rows
-    is_made = rows.is_leaf & (candidates.source == 0)
+    is_made = rows.is_leaf & (candidates.source == EDITED)
     scores = np.where(table.origin == Origin.GIVEN, CHOICE.given, table.detection_scores.double())
     is_other_class, colors = ~same_class(candidates, table), MaskColors.of(drawn)
     hides, steps, is_leaf, q = np.zeros(len(candidates), bool), list[Step](), rows.is_leaf, rows.shows

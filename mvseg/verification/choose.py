@@ -26,10 +26,10 @@ from mvseg.masks import SURE, Masks, Origin
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
+from mvseg.reconstruction.surface.surface_cache import Cache
 from mvseg.scene import Cameras
 from mvseg.verification.candidates import Candidates, Key, gather_candidates
-from mvseg.verification.choice import Choice, Rows, choose
+from mvseg.verification.choice import EDITED, Choice, Rows, choose
 from mvseg.verification.evidence import Drawn, draw_views, median_parallax, see
 from mvseg.verification.leaf_scores import Pairs, show_chances
 from mvseg.verification.match_again import match_again
@@ -66,13 +66,6 @@ class Leaves:
     rejected: tuple[RejectedCandidate, ...]
     keys: dict[int, Key]
     agreement: float = float("nan")
-
-    @staticmethod
-    def of(matched: Masks) -> Leaves:
-        """Leaves as they were matched, without probabilities."""
-        ids = matched.instance_ids
-        keys = {each: tuple(sorted(matched.proposal[ids == each].tolist())) for each in ids[ids > 0].unique().tolist()}
-        return Leaves(matched, surfaces={}, probabilities={}, rejected=(), keys=keys)
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +123,7 @@ class Judges:
     holds: bool = False
     photos: ReadPhoto | None = None
     min_probability: float | None = None
-    cache: SurfaceCache | None = None
+    cache: Cache | None = None
 
     def fit(self, masks: Masks) -> Mapping[int, LeafSurface]:
         """{instance id: surface}. Those of given masks are few, and final; others are fitted roughly."""
@@ -139,7 +132,7 @@ class Judges:
         return fit_roughly(masks, self.cameras, self.cache)
 
 
-def fit_roughly(masks: Masks, cameras: Cameras, cache: SurfaceCache | None) -> dict[int, LeafSurface]:
+def fit_roughly(masks: Masks, cameras: Cameras, cache: Cache | None) -> dict[int, LeafSurface]:
     """{instance id: surface}, fitted to few views. Nothing is warned of: the final fits warn."""
     with collect_warnings():
         ids = masks.instance_ids
@@ -150,8 +143,8 @@ def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | N
     """Match given masks (all proposals), matched with `config`, once more where they do not show their own leaf."""
     if not judges.has_surfaces or not matched.num_instances:
         return None
-    cameras, candidates = judges.cameras, gather_candidates([matched], matched, judges.fit)
-    drawn, own = draw_views(matched.regions, candidates.surfaces, cameras), candidates.of_rows(0)
+    cameras, candidates = judges.cameras, gather_candidates({"matched": matched}, matched, judges.fit)
+    drawn, own = draw_views(matched.regions, candidates.surfaces, cameras), candidates.of_rows("matched")
     evidence, scores = see(drawn, len(matched), candidates.is_credible), np.full(len(matched), CHOICE.given)
     q = show_chances(Pairs(candidates, evidence, scores))
     own_q = np.column_stack((q, np.zeros(len(q))))[np.arange(len(q)), own]
@@ -160,11 +153,10 @@ def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | N
 
 def choose_leaves(
     proposals: Masks,
-    matched: Sequence[Masks],
+    matched: Mapping[str, Masks],
     judges: Judges,
     *,
     edited: Edited | None = None,
-    drawn: Sequence[Drawn] = (),
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
@@ -178,18 +170,15 @@ def choose_leaves(
 
     Args:
         proposals: R masks; their ids do not matter.
-        matched: tables of some of the proposals, each matched, the sure ones first.
-        drawn: V views of the proposals alone, where they were drawn before.
+        matched: {source: table of some of the proposals, matched}; "matched" are the sure ones.
     """
-    proposals, matched = proposals.to("cpu"), [each.to("cpu") for each in matched]
-    if judges.holds and not judges.has_surfaces and edited is None:
-        return Leaves.of(matched[0])
+    proposals, matched = proposals.to("cpu"), {name: each.to("cpu") for name, each in matched.items()}
     table, row_of = _add_made(proposals, edited)
-    is_judged = judges.has_surfaces and (judges.holds or _is_surrounded(matched[0], edited, judges.cameras))
-    if edited is not None:  # first, so that what edits say of a leaf is not the same as what was there before
-        matched = [replace(edited.concerned(), proposal=row_of), *matched]
+    is_judged = judges.has_surfaces and (judges.holds or _is_surrounded(matched["matched"], edited, judges.cameras))
+    if edited is not None:  # the first name, so that what edits say of a leaf is not the same as what was there before
+        matched |= {EDITED: replace(edited.concerned(), proposal=row_of)}
     candidates = gather_candidates(matched, table, judges.fit if is_judged else None)
-    views = draw_views(table.regions, candidates.surfaces, judges.cameras, first=drawn, photos=judges.photos)
+    views = draw_views(table.regions, candidates.surfaces, judges.cameras, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
     if judges.holds:
         terms = _hold(terms, edited, candidates, table, row_of)
@@ -226,7 +215,7 @@ def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, d
     """The user as a term."""
     masks, held, stays = edited.masks, edited.is_held.numpy(), edited.stays.numpy()
     shows, rows = np.zeros((len(table), len(candidates))), row_of.numpy()
-    changed, is_changed = candidates.of_rows(0), candidates.source == 0
+    changed, is_changed = candidates.of_rows(EDITED), candidates.source == EDITED
     certain = edited.is_certain.numpy()
     for mask in np.flatnonzero(held).tolist():
         key = edited.keys[mask]
@@ -247,7 +236,7 @@ def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, d
 
 def _hold(terms: Rows, edited: Edited | None, candidates: Candidates, table: Masks, row_of: Tensor) -> Rows:
     """The ids of given masks as a term: those of the matcher, and after edits those before them."""
-    held = candidates.of_rows(0)
+    held = candidates.of_rows("matched" if edited is None else EDITED)
     if edited is not None:
         before = [-1 if key is None else candidates.place_of.get(key, -1) for key in edited.keys]
         rows = row_of.numpy()

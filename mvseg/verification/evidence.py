@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, hstack
+from scipy.sparse import csc_array
 
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.crop import Crop
@@ -37,7 +37,6 @@ class Drawn:
         depth: (K,) of their middles, world units; infinite without a surface.
         colors: (P,) int64, the colour of each pixel but for its lightness, a number below `COLORS.hues` squared; None
             without a photo.
-        first: the first masks alone, where they were drawn before; None: none of them.
     """
 
     rows: Ints
@@ -45,7 +44,6 @@ class Drawn:
     parts: csc_array
     depth: Floats
     colors: Ints | None = None
-    first: Drawn | None = None
 
     @cached_property
     def common(self) -> Floats:
@@ -56,10 +54,8 @@ class Drawn:
     @cached_property
     def is_shared(self) -> Bools:
         """(N, N) whether one covers more than `EVIDENCE.shared` of the smaller one of two masks."""
-        known = 0 if self.first is None else len(self.first.rows)
-        areas, both = self.masks.sum(0), (self.masks.T @ self.masks[:, known:]).toarray()
-        new: Bools = both > EVIDENCE.shared * np.maximum(np.minimum(areas[:, None], areas[known:]), 1)
-        return new if self.first is None else np.block([[self.first.is_shared, new[:known]], [new.T]])
+        areas, both = self.masks.sum(0), (self.masks.T @ self.masks).toarray()
+        return np.asarray(both > EVIDENCE.shared * np.maximum(np.minimum(areas[:, None], areas), 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +79,9 @@ def draw_views(
     surfaces: Sequence[LeafSurface | None],
     cameras: Cameras,
     *,
-    first: Sequence[Drawn] = (),
     photos: ReadPhoto | None = None,
 ) -> tuple[Drawn, ...]:
-    """V views of D regions and K surfaces, on the CPU. `first`: views of the first of the regions, which are not drawn
-    again; `photos`: for their colours."""
+    """V views of D regions and K surfaces, on the CPU. `photos`: for their colours."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
     crops = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
@@ -95,17 +89,10 @@ def draw_views(
         step = -(-max(width, height) // EVIDENCE.most_px)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         rows = (regions.view_index == view).nonzero()[:, 0].numpy()
-        first_views = first[view] if first else None
-        new = rows if first_views is None else rows[len(first_views.rows) :]
-        pixels = _columns([regions.placed(row) for row in new.tolist()], size, step)
-        if first_views is not None:
-            pixels = hstack((first_views.masks, pixels), format="csc")
+        pixels = _columns([regions.placed(row) for row in rows.tolist()], size, step)
         covered = _columns([parts[view] for parts in crops], size, step)
-        colors = None if first_views is None else first_views.colors
-        if photos is not None and colors is None:
-            colors = _number_colors(photos(view)[step // 2 :: step, step // 2 :: step])
-        depth = all_depths[view]
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=depth, colors=colors, first=first_views))
+        colors = None if photos is None else _number_colors(photos(view)[step // 2 :: step, step // 2 :: step])
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], colors=colors))
     return tuple(drawn)
 
 

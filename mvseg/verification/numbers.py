@@ -47,10 +47,6 @@ class DrawnNumbers:
     least_visible: float = 0.3  # chosen: unhidden fraction of a surface that a view sees openly; see `open_pixels`
     least_colored: float = 0.8  # chosen: min. fraction of the unhidden part that has the colour of leaves
     half: float = 0.5  # definition: a mask shows half a leaf if it covers less of the surface's image
-    rounds: int = 2  # limit: fits: the second one is to what is found where the surface of the first one is
-    beside_px: int = 2  # chosen: max. pixels between leaf colour and where a view may show a leaf
-    most_against: float = 0.15  # chosen: fraction of views with another colour at a point: stakes hide leaves
-    reach: float = 0.1  # chosen: max. reach of a leaf beyond its first surface, in roots of the surface's area
 
 
 @dataclass(frozen=True)

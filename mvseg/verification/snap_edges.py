@@ -32,7 +32,7 @@ def snap_masks(
     photos: ReadPhoto,
     *,
     missing: Sequence[Crop | None] = (),
-    cache: dict[str, Bools] | None = None,
+    cache: dict[str, Any] | None = None,
 ) -> Masks:
     """Move the edges of the masks that a detector found to those of colour, see `snap`; the others stay as they are.
 
@@ -66,8 +66,8 @@ def snap_masks(
             asked = mask, around.cut(photo), others, likely
             digest = hashlib.sha256(b"".join(f"{each.shape}".encode() + each.tobytes() for each in asked)).hexdigest()
             if digest not in cache:
-                cache[digest] = snap(mask, asked[1], others=others, likely=likely)
-            snapped = cache[digest]
+                cache[digest] = torch.from_numpy(snap(mask, asked[1], others=others, likely=likely))
+            snapped = cache[digest].numpy()
             covered |= snapped
             crops[row] = Crop.of(snapped, (x1, y1))
     return replace_crops(masks, crops)

@@ -20,7 +20,7 @@ from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
-from mvseg.detection import mask_rcnn
+from mvseg.detection import proposals as proposing
 from mvseg.detection.config import DetectConfig
 from mvseg.matching.config import MatchConfig
 from mvseg.system.atomic import lock_folder
@@ -111,13 +111,13 @@ def test_detections_are_kept_for_other_options_of_later_stages(
     scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[object] = []
-    run_heads = mask_rcnn.run_heads
+    run_heads = proposing.run_heads
 
     def count(*arguments: object, **options: object) -> object:
         looked.append(arguments)
         return run_heads(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mask_rcnn, "run_heads", count)
+    monkeypatch.setattr(proposing, "run_heads", count)
     out, scene = tmp_path / "out", replace(scene, masks=None)
     config = replace(CONFIG, detect=DetectConfig(min_score=0.05, image_size=800))  # looks at no other size
     assert not work_on_scene(out, config, scene).is_kept

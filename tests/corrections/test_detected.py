@@ -23,13 +23,11 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import MOST_BYTES, pack_plant, unpack_plant
 from mvseg.pipeline.find_in_photos import find_in_photos
-from mvseg.pipeline.plant import Plant
+from mvseg.pipeline.plant import SOURCES, Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import Approach
 from mvseg.scene import Cameras, Scene, View
 from mvseg.verification import choose as choosing
-from mvseg.verification.choose import Leaves
-from mvseg.verification.evidence import Drawn
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 REGIONS, IDS = as_regions(true_maps())
@@ -83,22 +81,20 @@ def as_painted(state: Plant) -> list[np.ndarray]:
 def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -> None:
     opened, reject = open_photos(SCENE), Corrections((Reject(view="v0", at=at(WEAK, 0), everywhere=True),))
     approach = Approach(LEAVES[1].views, LEAVES[1].coefficients, LEAVES[1].offsets_px, spread=0.5)
-    opened.surfaces.surfaces["name"] = LEAVES[1]
-    opened.surfaces.approaches.update({"one": approach, "other": None})
-    opened.snapped["edge"] = REGIONS.crop(0).numpy()
+    opened.cache.update({"name": LEAVES[1], "one": approach, "other": None, "edge": REGIONS.crop(0)})
     content = pack_plant(find_in_photos(opened), ["odd"])
     assert content is not None
     found = unpack_plant(content, open_photos(SCENE))
     assert found is not None
     plant, said = found
-    cache = plant.opened.surfaces
-    np.testing.assert_array_equal(plant.opened.snapped["edge"], REGIONS.crop(0).numpy())
-    assert torch.equal(cache.surfaces["name"].covariance, LEAVES[1].covariance)
-    again = cache.approaches["one"]
+    cache = plant.opened.cache
+    assert torch.equal(cache["edge"], REGIONS.crop(0))
+    assert torch.equal(cache["name"].covariance, LEAVES[1].covariance)
+    again = cache["one"]
     assert again is not None
     assert again.spread == 0.5
     assert torch.equal(again.coefficients, approach.coefficients)
-    assert cache.approaches["other"] is None
+    assert cache["other"] is None
     before = run()
     assert said == ["odd"]
     assert plant.instances.probabilities == before.instances.probabilities
@@ -163,27 +159,13 @@ def test_edits_that_say_what_is_seen_match_nothing_anew(monkeypatch: pytest.Monk
         np.testing.assert_array_equal(np.where((one == 1) & (view == 4), 0, one), other)
 
 
-def test_what_was_drawn_ahead_is_used_and_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    edit = Reject(view="v0", at=at(1, 0), everywhere=True)
-    expected, plant, used = run(edit), run(), []
-
-    def choose(*given: Any, drawn: tuple[Drawn, ...], **options: Any) -> Leaves:
-        used.append(drawn)
-        return choosing.choose_leaves(*given, drawn=drawn, **options)
-
-    plant.draw_ahead()
-    ahead = plant.drawn
-    assert all("is_shared" in vars(each) for each in ahead)
-    for name in ("plant.draw_views", "plant.add_beside"):
-        monkeypatch.setattr(f"mvseg.pipeline.{name}", None)  # nobody waits for these again
-    monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
-    found = apply_edits(plant, Corrections((edit,)))
-    assert used == [ahead]
-    assert found.instances.probabilities == expected.instances.probabilities
-    assert [each.chance for each in found.rejected] == [each.chance for each in expected.rejected]
-    for name in ("instance_ids", "match_scores", "origin"):
-        assert torch.equal(getattr(found.masks, name), getattr(expected.masks, name))
-    assert torch.equal(found.masks.regions.crops, expected.masks.regions.crops)
+def test_sources_have_no_order_and_one_that_is_left_out_leaves_its_candidates_out(monkeypatch: Any) -> None:
+    expected = run()
+    monkeypatch.setattr("mvseg.pipeline.plant.SOURCES", dict(reversed(SOURCES.items())))
+    assert run().keys == expected.keys
+    assert torch.equal(run().masks.instance_ids, expected.masks.instance_ids)
+    monkeypatch.setattr("mvseg.pipeline.plant.SOURCES", {"matched": SOURCES["matched"]})
+    assert set(np.unique(as_painted(run()))) == {0, 1, 2}  # no sure mask shows the weak leaf
 
 
 @pytest.mark.parametrize("leaf", [1, 2])

@@ -165,7 +165,7 @@ def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin, monkey
     proposals = replace(masks, origin=torch.full_like(masks.origin, Origin.DETECTED))
     for surfaces in (LEAVES, {}):
         monkeypatch.setattr("mvseg.verification.choose.fit_roughly", lambda *_, known=surfaces: known)
-        chosen = choose_leaves(proposals, [proposals], Judges(CAMERAS), edited=edit(masks))
+        chosen = choose_leaves(proposals, {"matched": proposals}, Judges(CAMERAS), edited=edit(masks))
         assert squares(chosen.masks) == (stays if origin in CORRECTED or not surfaces else [])
 
 

@@ -14,14 +14,13 @@ from blade_scene import as_regions
 from found_masks import FoundMasks, open_photos
 from mvseg import demo_scene, load_scene
 from mvseg.config import RunConfig
-from mvseg.detection.choose_size import choose_near, choose_size
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline.find_in_photos import find_in_photos
+from mvseg.pipeline.find_in_photos import choose_near, choose_size, find_in_photos
 from mvseg.verification.leaf_scores import Rating, order_ratings, rate_pass
 from warned import warns_of
 
@@ -42,10 +41,7 @@ def look_of(masks: Masks, longest: int = 32) -> Any:
 def expecting(
     area: float, longest: int = 800, agreement: float = 0.9, *, leaves: int = 9, expected: float = 60.0
 ) -> Any:
-    rating = Rating(area, expected, leaves)
-    return SimpleNamespace(
-        rating=rating, leaves=SimpleNamespace(agreement=agreement), detected=SimpleNamespace(longest=longest)
-    )
+    return SimpleNamespace(rating=Rating(area, expected, leaves), agreement=agreement, image_size=longest)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +95,7 @@ def test_the_sizes_next_to_the_one_that_was_learned(
         looks.append(size)
         return expecting(areas[size], size)
 
-    assert choose_near(see, asked[0], most=most)[0].detected.longest == best
+    assert choose_near(see, asked[0], most=most)[0].image_size == best
     assert looks == asked
 
 

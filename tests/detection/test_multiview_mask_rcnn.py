@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,18 +12,22 @@ from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredic
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import MultiScaleRoIAlign, box_iou
 
-from leafy_scene import write_leafy_scene
-from matched import matched
+from mvseg.demo import demo_scene
 from mvseg.detection.loop import match_proposals
-from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.nms import cluster_aware_nms
 from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.mask_cut import decide_masks
+from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputError
 from mvseg.formats.photos import load_photos
-from mvseg.masks import Masks, Origin
+from mvseg.formats.scene_folder import load_scene
+from mvseg.masks import Masks
 from mvseg.matching.match import find_disagreement
 from mvseg.matching.result import Matching
+from mvseg.pipeline.find_in_photos import find_in_photos
+from mvseg.pipeline.finish import complete_masks
+from mvseg.pipeline.mask_rcnn import MultiViewMaskRCNN
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from simulated_proposals import simulate_proposals
@@ -186,7 +189,7 @@ def test_wrong_arguments_are_named() -> None:
     with pytest.raises(InputError, match=r"image 0 is uint8, expected floats in \[0, 1\]: image.float\(\) / 255"):
         wrapped(integers, cameras=small_cameras(3))
     with pytest.raises(InputError, match="the image is uint8"):
-        wrapped.detect(integers[0])
+        wrapped.proposer.propose(integers[0])
     with pytest.raises(InputError, match="expected one per image, two or more"):
         wrapped(some_images(1), cameras=small_cameras(2)[:1])
     with pytest.raises(InputError, match=r"expected Cameras \(of a scene"):
@@ -305,25 +308,15 @@ def test_detections_per_view_are_limited() -> None:
     assert kept.regions.num_per_view.max() == 5
 
 
-def test_the_views_choose_where_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mask that scores too low to be matched is found again by the surface of its leaf."""
-    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160, span_deg=180)
-    missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
-    numbered = replace(leafy.regions, labels=torch.arange(len(missed)))
-    scores = torch.where(missed, 0.06, 0.7)
-    proposals = Masks.of(numbered, detection_scores=scores, origin=Origin.DETECTED)
-    found = matched(leafy.regions.select(~missed))
-    sure = proposals.select(~missed)
-    sure = replace(sure, instance_ids=found.instance_ids, match_scores=found.match_scores)
-    wrapped = MultiViewMaskRCNN(tiny_detector(), verify=True)
-    monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: found.with_masks(sure))
-    monkeypatch.setattr("mvseg.detection.find_leaves.gather_proposals", lambda *_: (proposals, None))
-    results = wrapped(load_photos(leafy.scene), cameras=leafy.scene.cameras)
-    assert [len(result["instance_ids"]) for result in results] == [2] * 5
-    assert all(result["instance_ids"].unique().numel() == 2 for result in results)
-    low = results[2]["scores"].argmin()
-    true, shown = leafy.regions.mask(int(missed.nonzero()), 160, 160), results[2]["masks"][low, 0].bool()
-    assert float((true & shown).sum() / (true | shown).sum()) > 0.9
+@pytest.mark.slow
+def test_both_doors_find_the_same_leaves() -> None:
+    expected = complete_masks(find_in_photos(open_scene(demo_scene()))).masks
+    scene, wrapped = load_scene(demo_scene()), MultiViewMaskRCNN(load_detector("leaf-lite"), verify=True)
+    masks = wrapped.find_regions(load_photos(scene), scene.cameras).masks
+    for name in ("view_index", "instance_ids", "match_scores"):
+        assert torch.equal(getattr(masks, name), getattr(expected, name))
+    assert torch.equal(masks.regions.crops, expected.regions.crops)
+    assert wrapped.state_dict().keys() == load_detector("leaf-lite").state_dict().keys()
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:

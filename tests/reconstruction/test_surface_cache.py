@@ -16,7 +16,7 @@ from mvseg.reconstruction.surface import fit_surfaces as fitting
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.patch_image import hiding_pixels, select_hiding
-from mvseg.reconstruction.surface.surface_cache import SurfaceCache
+from mvseg.reconstruction.surface.surface_cache import Cache
 from mvseg.verification.evidence import paint_view
 from three_leaves import CAMERAS
 
@@ -35,7 +35,7 @@ def are_same(one: LeafSurface, other: LeafSurface) -> bool:
     return all(same) and one.is_oriented == other.is_oriented and one.quality == other.quality
 
 
-def fit(cache: SurfaceCache | None, ids: Tensor, **how: bool) -> dict[int, LeafSurface]:
+def fit(cache: Cache | None, ids: Tensor, **how: bool) -> dict[int, LeafSurface]:
     return fit_surfaces(REGIONS, ids, FEW, cache=cache, **how)
 
 
@@ -46,7 +46,7 @@ def test_what_was_fitted_before_changes_no_bit(is_rough: bool) -> None:
     moved[(IDS == 3).nonzero()[0, 0]] = -1
     tables = [IDS, without_first, moved, IDS]
     fresh = [fit(None, ids, is_rough=is_rough) for ids in tables]
-    cache = SurfaceCache()
+    cache: Cache = {}
     for ids, expected in zip(tables, fresh, strict=True):
         found = fit(cache, ids, is_rough=is_rough)
         assert list(found) == list(expected)
@@ -56,7 +56,7 @@ def test_what_was_fitted_before_changes_no_bit(is_rough: bool) -> None:
 def test_a_leaf_is_fitted_again_only_where_something_that_it_follows_from_changed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cache, asked = SurfaceCache(), []
+    cache, asked = {}, []
     first, again = fitting._fit_first, fitting._fit_again
     monkeypatch.setattr(fitting, "_fit_first", lambda each: (asked.extend(["first"] * len(each)), first(each))[1])
     monkeypatch.setattr(fitting, "_fit_again", lambda each: (asked.extend(["again"] * len(each)), again(each))[1])

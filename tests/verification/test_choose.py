@@ -17,6 +17,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification import leaf_scores
 from mvseg.verification.candidates import Key, gather_candidates
 from mvseg.verification.choice import assign_masks, least_chance
 from mvseg.verification.choose import Edited, Judges, Leaves, add_beside, choose_leaves
@@ -67,7 +68,7 @@ def choose(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvseg.verification.choose.fit_roughly", fit)
         judges = Judges(cameras, min_probability=min_probability)
-        return choose_leaves(proposals, [matched], judges, edited=edited)
+        return choose_leaves(proposals, {"matched": matched}, judges, edited=edited)
 
 
 def edit(masks: Masks, *, keys: Sequence[Key] = (), gone: Sequence[int] = ()) -> Edited:
@@ -167,6 +168,16 @@ def test_an_edit_that_touches_nothing_changes_nothing() -> None:
     assert torch.equal(plain.masks.instance_ids, edited.masks.instance_ids)
     assert torch.equal(plain.masks.match_scores, edited.masks.match_scores)
     assert torch.equal(plain.masks.proposal, edited.masks.proposal)
+
+
+def test_terms_have_no_order_and_one_that_is_left_out_has_no_weight(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = choose(matched_of(PROPOSALS, IDS))
+    for name in ("TERMS", "LEAF_TERMS"):
+        monkeypatch.setattr(leaf_scores, name, dict(reversed(getattr(leaf_scores, name).items())))
+    assert choose(matched_of(PROPOSALS, IDS)).probabilities == plain.probabilities
+    terms = {"one": np.ones(3), "other": np.arange(3.0)}
+    without = leaf_scores.sum_terms({"one": 2.0}, terms)
+    np.testing.assert_array_equal(leaf_scores.sum_terms({"other": 0.0, "one": 2.0}, terms), without)
 
 
 def test_masks_are_added_where_the_others_show_nothing() -> None:
@@ -320,8 +331,8 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
     proposals = proposals_of(every, torch.full((len(every),), 0.8))
     matched = matched_of(proposals, torch.arange(1, 4).repeat_interleave(len(cameras)))
     judges = Judges(cameras)
-    stem = gather_candidates([matched], proposals, judges.fit).stem
-    leaves = choose_leaves(proposals, [matched], judges)
+    stem = gather_candidates({"matched": matched}, proposals, judges.fit).stem
+    leaves = choose_leaves(proposals, {"matched": matched}, judges)
     is_stem_told = max(half_widths) > 0.2
     assert (stem[:2] < 0.01).all()
     assert stem[2] > 0.9 if is_stem_told else stem[2] < 0.01

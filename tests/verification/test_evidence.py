@@ -51,18 +51,6 @@ def test_the_same_as_whole_frames(hides: np.ndarray) -> None:
     np.testing.assert_allclose(found.share, share)
 
 
-@pytest.mark.parametrize("num_first", [0, 5, len(REGIONS)])
-def test_masks_that_were_drawn_before_are_not_drawn_again(num_first: int) -> None:
-    whole = draw_views(REGIONS, SURFACES, CAMERAS)
-    first = draw_views(REGIONS.select(torch.arange(num_first)), (), CAMERAS)
-    for one, other in zip(draw_views(REGIONS, SURFACES, CAMERAS, first=first), whole, strict=True):
-        assert one.first is not None
-        assert len(one.first.rows) == (one.rows < num_first).sum()
-        np.testing.assert_array_equal(one.rows, other.rows)
-        np.testing.assert_array_equal(one.masks.toarray(), other.masks.toarray())
-        np.testing.assert_array_equal(one.is_shared, other.is_shared)
-
-
 def test_large_photos_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = see(draw_views(REGIONS, SURFACES, CAMERAS), len(REGIONS), np.ones(4, bool))
     monkeypatch.setattr(evidence, "EVIDENCE", replace(EVIDENCE, most_px=SIZE // 3))

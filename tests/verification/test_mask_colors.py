@@ -66,7 +66,7 @@ def test_what_has_other_colors_than_clear_leaves_is_less_likely_a_leaf(monkeypat
 
     def chance(*colors: int) -> float:
         judges = Judges(CAMERAS, photos=lambda view: paint(view, dict(enumerate(colors, 1))), min_probability=0.0)
-        leaves = choose_leaves(masks, [masks], judges)
+        leaves = choose_leaves(masks, {"matched": masks}, judges)
         ids, proposal = leaves.masks.instance_ids, leaves.masks.proposal
         return leaves.probabilities[int(ids[IDS[proposal] == 3].mode().values)]
 

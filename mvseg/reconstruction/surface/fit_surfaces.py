@@ -33,7 +33,7 @@ from mvseg.reconstruction.surface.patch_image import (
     select_hiding,
     view_ious,
 )
-from mvseg.reconstruction.surface.surface_cache import Approach, SurfaceCache, name_first, name_second
+from mvseg.reconstruction.surface.surface_cache import Approach, Cache, name_first, name_second, reuse_object
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
@@ -52,7 +52,7 @@ def fit_surfaces(
     same_segmenter: Mapping[int, LeafSurface] | None = None,
     most_views: int | None = None,
     is_rough: bool = False,
-    cache: SurfaceCache | None = None,
+    cache: Cache | None = None,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
@@ -79,7 +79,7 @@ def fit_surfaces(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
-    cache = SurfaceCache() if cache is None else cache
+    cache = {} if cache is None else cache
     workers = now_running().workers if len(regions) >= SEARCH.few_masks else ()
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = instance_frames(regions, instance_ids, cameras)
@@ -100,17 +100,17 @@ def fit_surfaces(
     first = {each.name: each for each in asked.values()}
     if is_rough:
         names = {instance: f"rough {each.name}" for instance, each in asked.items()}
-        _fit_new(cache.surfaces, {f"rough {name}": each for name, each in first.items()}, _fit_roughly, workers)
+        _fit_new(cache, {f"rough {name}": each for name, each in first.items()}, _fit_roughly, workers)
     else:
-        _fit_new(cache.approaches, first, _fit_first, workers)
+        _fit_new(cache, first, _fit_first, workers)
         again = _ask_again(asked, cache, same_segmenter)
         names = {instance: each.name for instance, each in again.items()}
-        _fit_new(cache.surfaces, {each.name: each for each in again.values()}, _fit_again, workers)
+        _fit_new(cache, {each.name: each for each in again.values()}, _fit_again, workers)
     for instance, each in asked.items():
         nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
-        surfaces[instance] = cache.surfaces[names[instance]] if instance in names else nothing
+        surfaces[instance] = cache[names[instance]] if instance in names else nothing
     oriented = orient_surfaces(dict(sorted(surfaces.items())), cameras)
-    return ByInstance((n, cache.orient(names[n], each) if n in names else each) for n, each in oriented.items())
+    return ByInstance((n, reuse_object(cache, names[n], each) if n in names else each) for n, each in oriented.items())
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +132,7 @@ class _AskedAgain:
 
 
 def _fit_new(
-    cache: dict[str, Any],
+    cache: Cache,
     asked: Mapping[str, Any],
     fit: Callable[[Sequence[Any]], list[Any]],
     workers: Workers,
@@ -147,9 +147,9 @@ def _fit_new(
 
 
 def _ask_again(
-    asked: Mapping[int, _Asked], cache: SurfaceCache, same_segmenter: Mapping[int, LeafSurface] | None
+    asked: Mapping[int, _Asked], cache: Cache, same_segmenter: Mapping[int, LeafSurface] | None
 ) -> dict[int, _AskedAgain]:
-    found = {instance: cache.approaches[each.name] for instance, each in asked.items()}
+    found = {instance: cache[each.name] for instance, each in asked.items()}
     approaches = {instance: each for instance, each in found.items() if each is not None}
     measured: Mapping[int, Approach | LeafSurface] = approaches if same_segmenter is None else same_segmenter
     offsets = [measured[instance].offsets_px.numpy() for instance in sorted(measured)]

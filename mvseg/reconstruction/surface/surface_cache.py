@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,9 @@ from mvseg.reconstruction import numbers
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.mask_errors import MaskErrors
 from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack
+
+Cache = dict[str, Any]  # {digest of all inputs: answer}
+ORIENTED = "oriented"  # definition: first word of the names of surfaces that are there a second time
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,24 +41,11 @@ class Approach:
     spread: float
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceCache:
-    """Surfaces that were fitted; `fit_surfaces` looks here first, and adds to it.
-
-    Attributes:
-        approaches: {name of a first fit: its outcome}; None where masks agree on no point.
-        surfaces: {name of a rough or second fit: the surface}, not oriented.
-        oriented: {name, and how it lies: the surface}, which remembers its image.
-    """
-
-    approaches: dict[str, Approach | None] = field(default_factory=dict)
-    surfaces: dict[str, LeafSurface] = field(default_factory=dict)
-    oriented: dict[str, LeafSurface] = field(default_factory=dict)
-
-    def orient(self, name: str, surface: LeafSurface) -> LeafSurface:
-        """The surface as it is oriented; the object of an earlier call where both are equal."""
-        how = f"{name} {surface.is_oriented} {_digest(surface.coefficients.numpy())}"
-        return self.oriented.setdefault(how, surface)
+def reuse_object(cache: Cache, name: str, surface: LeafSurface) -> LeafSurface:
+    """The surface as it is oriented; the object of an earlier call, which remembers its image, where both are equal."""
+    how = f"{ORIENTED} {name} {surface.is_oriented} {_digest(surface.coefficients.numpy())}"
+    oriented: LeafSurface = cache.setdefault(how, surface)
+    return oriented
 
 
 def name_first(masks: MaskStack, start: Floats | None) -> str:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
+from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import Pass, find_leaves
-from mvseg.detection.loop import match_proposals
 from mvseg.detection.numbers import DETECTION
-from mvseg.detection.proposals import gather_proposals
-from mvseg.detectors.run import run_heads
+from mvseg.detection.proposals import Proposer, check_image
+from mvseg.detectors.folded_norms import fold_norms
 from mvseg.errors import InputError, warn
+from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import find_disagreement
 from mvseg.matching.result import Matching
-from mvseg.scene import Cameras
-from mvseg.verification.missing_parts import find_missing_parts
-from mvseg.verification.snap_edges import snap_masks
+from mvseg.pipeline.find_in_photos import find_in_photos
+from mvseg.pipeline.finish import complete_masks
+from mvseg.pipeline.open_scene import Opened
+from mvseg.scene import Cameras, Scene, View
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
@@ -41,8 +45,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views show it to be another instance (`backed_by_views`); match what is left.
-    5. With `verify`, what is matched of the sure proposals (`sure_score`), and of many more (`more_score`), are
-       candidates only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
+    5. With `verify`, the same stages follow as in `mvseg infer` (`find_in_photos`): the detector looks at several
+       sizes, and again at the parts that show the plant; the views choose leaves and masks from everything that it
+       proposes. The leaves are those of `mvseg infer --learn off`.
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
     here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
@@ -70,19 +75,24 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         num_iterations: int = 1,
         proposal_iou: float = 0.7,
         cluster_iou: float = 0.3,
-        proposals_per_view: int = 300,
+        proposals_per_view: int = DETECTION.most_proposals,
         match: MatchConfig = MatchConfig(),
         verify: bool = False,
     ) -> None:
         if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
             raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
         super().__init__(detector.backbone, detector.rpn, detector.roi_heads, detector.transform)
-        self.num_iterations = num_iterations
-        self.proposal_iou = proposal_iou
-        self.cluster_iou = cluster_iou
-        self.proposals_per_view = proposals_per_view
-        self.match = match
-        self.verify = verify
+        self.verify, self.proposer = (
+            verify,
+            Proposer(
+                self,
+                num_iterations=num_iterations,
+                proposal_iou=proposal_iou,
+                cluster_iou=cluster_iou,
+                proposals_per_view=proposals_per_view,
+                match=match,
+            ),
+        )
         self.train(detector.training)
 
     def forward(
@@ -114,15 +124,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
                 _check_labels(targets, int(self.roi_heads.box_predictor.cls_score.out_features) - 1)
             return super().forward(images, targets)
         for view, image in enumerate(images):
-            _check_image(image, f"image {view}")
+            check_image(image, f"image {view}")
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
         if self.verify:
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
-        with torch.no_grad():
-            detections = [self._propose(image) for image in images]
-            matching = _disagreement_of(self.match_detections(detections, cameras))
-            return self._collect(detections, sizes, masks=matching.masks)
+        detections = [self.proposer.propose(image) for image in images]
+        return self._collect(detections, sizes, masks=self._match(detections, cameras).masks)
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
         """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time (with
@@ -140,69 +148,33 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         """
         detections, sizes, photos = [], [], []
         for image in images:
-            detections.append(self.detect(image))
             if self.verify:
+                check_image(image, "an image")
                 photos.append((255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy())
+            else:
+                detections.append({key: value.cpu() for key, value in self.proposer.propose(image).items()})
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         if not self.verify:
-            return _disagreement_of(self.match_detections(detections, cameras))
-        config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
-        posed = cameras.to("cpu")
-        detected = Pass(self.match_detections, detections, posed, config.min_score)
-        leaves = find_leaves(detected, posed, config=config, photos=photos.__getitem__).leaves
-        missing = find_missing_parts(leaves.masks, leaves.surfaces, photos.__getitem__, cameras=posed)
-        return _disagreement_of(detected.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__, missing=missing))
+            return self._match(detections, cameras)
+        least = max(DETECTION.sure_score, self.roi_heads.score_thresh)
+        config = RunConfig(detect=DetectConfig(min_score=least), match=self.proposer.match)
+        views = tuple(View(f"image {view}", Path(f"image {view}")) for view in range(len(sizes)))
+        scene = Scene(name="images", views=views, cameras=cameras.to("cpu"), unit="", up=None)
+        proposer = replace(self.proposer, detector=fold_norms(copy.deepcopy(self)))
+        opened = Opened(scene, Photos(scene, dict(enumerate(photos))), config, proposer=proposer)
+        plant = complete_masks(find_in_photos(opened))
+        if plant.disagreement is not None:
+            warn(plant.disagreement)
+        return plant.matching
+
+    def _match(self, detections: list[dict[str, Tensor]], cameras: Cameras) -> Matching:
+        matching = self.proposer.match_detections(detections, cameras)
+        if (disagreement := find_disagreement(matching, is_detected=True)) is not None:
+            warn(disagreement)
+        return matching
 
     @torch.no_grad()
-    def detect(self, image: Tensor) -> dict[str, Tensor]:
-        """The excessive set of one image (3, H, W) in [0, 1], on the CPU: what `match_detections` takes.
-
-        Raises:
-            InputError: an image of integers.
-        """
-        _check_image(image, "the image")
-        return {key: value.cpu() for key, value in self._propose(image).items()}
-
-    @torch.no_grad()
-    def match_detections(
-        self,
-        detections: Sequence[dict[str, Tensor]],
-        cameras: Cameras,
-        *,
-        min_score: float = 0.0,
-        residual_px: int | None = None,
-    ) -> Matching:
-        """Second half of `find_regions`: match the output of `detect` for V images, of proposals that score `min_score`
-        or more. `labels` of its regions are rows of the excessive set. `residual_px`: see `match_proposals`."""
-        cameras = cameras.to(detections[0]["boxes"].device)
-        with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
-            proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
-            is_asked = (proposals.regions.areas > 0) & (proposals.detection_scores >= min_score)
-            matching = match_proposals(
-                proposals.select(is_asked),
-                cameras,
-                boxes=boxes[is_asked],
-                num_iterations=self.num_iterations,
-                cluster_iou=self.cluster_iou,
-                detections_per_view=self.roi_heads.detections_per_img,
-                match=self.match,
-                residual_px=residual_px,
-            )
-        return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
-
-    def _propose(self, image: Tensor) -> dict[str, Tensor]:
-        """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""
-        detections = run_heads(
-            self,
-            image,
-            nms_thresh=self.proposal_iou,
-            detections_per_img=self.proposals_per_view,
-            num_growths=DETECTION.num_growths,
-        )
-        frame, is_good = detections.pop("frame"), detections["scores"] >= self.roi_heads.score_thresh
-        return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
-
     def _collect(
         self, detections: list[dict[str, Tensor]], sizes: list[list[int]], *, masks: Masks
     ) -> list[dict[str, Tensor]]:
@@ -216,13 +188,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result | {"instance_ids": here.instance_ids, "match_scores": here.match_scores})
             start += len(proposals["boxes"])
         return results
-
-
-def _disagreement_of(matching: Matching) -> Matching:
-    """Return the matching; warn (InputWarning) if the views disagree, see `find_disagreement`."""
-    if (disagreement := find_disagreement(matching, is_detected=True)) is not None:
-        warn(disagreement)
-    return matching
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:
@@ -251,18 +216,6 @@ def _check_labels(targets: Sequence[dict[str, Tensor]], most: int) -> None:
         if len(labels) and not 1 <= int(labels.min()) <= int(labels.max()) <= most:
             found = f"{int(labels.min())} to {int(labels.max())}"
             raise InputError(f"target {view} has labels from {found}, expected 1 to {most}, the detector's classes")
-
-
-def _check_image(image: Tensor, name: str) -> None:
-    if not isinstance(image, Tensor):
-        raise InputError(f"{name} is a {type(image).__name__}, expected a Tensor: torch.from_numpy(image)")
-    if image.ndim != 3 or len(image) != 3:
-        raise InputError(f"{name} has shape {tuple(image.shape)}, expected (3, height, width), of red, green and blue")
-    if not image.is_floating_point():
-        kind = str(image.dtype).removeprefix("torch.")
-        raise InputError(f"{name} is {kind}, expected floats in [0, 1]: image.float() / 255")
-    if float(image.max()) > DETECTION.brightest:
-        raise InputError(f"{name} has values up to {float(image.max()):g}, expected floats in [0, 1]: image / 255")
 
 
 def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:
