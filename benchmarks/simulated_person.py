@@ -32,13 +32,13 @@ class Answer:
     Attributes:
         name: the same answer has the same name whatever the ids and rows of a result are.
         edits: in their order.
-        doubt: of the question.
+        change: of the question.
         leaves: true leaves concerned, 0 for what is none: no two answers of a round concern the same ones.
     """
 
     name: str
     edits: tuple[Edit, ...]
-    doubt: float
+    change: float
     leaves: frozenset[int]
 
 
@@ -46,7 +46,7 @@ def choose_answers(found: Sequence[Answer], *, most: int, done: Collection[str])
     """Answers for the next round, at most so many, in the order of their questions."""
     chosen: list[Answer] = []
     touched: set[int] = set()
-    for each in sorted((one for one in found if one.name not in done), key=lambda one: (-one.doubt, one.name)):
+    for each in sorted((one for one in found if one.name not in done), key=lambda one: (-one.change, one.name)):
         if len(chosen) < most and not touched & each.leaves:
             chosen.append(each)
             touched |= each.leaves - {0}
@@ -175,7 +175,7 @@ def list_answers(look: Look, edits: Sequence[Edit] = ()) -> list[Answer]:
         if made:
             at = made[0].polygon[0] if isinstance(made[0], Outline) else look.point(each)
             name = f"{each.kind} {look.scene.views[each.view].name} {at[0]:.0f} {at[1]:.0f}"
-            found.append(Answer(name, made, each.doubt, frozenset(leaves)))
+            found.append(Answer(name, made, each.change, frozenset(leaves)))
     return found
 
 
@@ -212,16 +212,15 @@ def _is_answered(look: Look, doubt: MaskQuestion, said: Sequence[tuple[int, int,
 def _answer_mask(look: Look, doubt: MaskQuestion) -> tuple[tuple[Edit, ...], set[int]]:
     """Of a question about a mask."""
     leaf, view = int(look.leaf[doubt.region]), look.place(doubt.region)
-    owner, is_few = look.owner.get(doubt.instance, 0), doubt.kind == "few"
-    if leaf == IGNORE_LABEL or (is_few and owner and look.home[owner] != doubt.instance):
+    if leaf == IGNORE_LABEL:
         return (), set()
-    if is_few or doubt.other < 0:
-        is_leaf = owner if is_few else leaf
-        kind = Confirm if is_leaf else Reject
-        return (kind(view=view[0], at=view[1:], everywhere=is_few),), {is_leaf}
+    if leaf == 0:
+        instance = int(look.ids[doubt.region])
+        owner = look.owner.get(instance, 0)
+        return (Reject(view=view[0], at=view[1:], everywhere=instance > 0 and owner == 0),), {owner}
+    if doubt.other < 0:
+        return (Confirm(view=view[0], at=view[1:]),), {leaf}
     other = int(look.leaf[doubt.other])
-    if leaf == 0 and doubt.kind != "covered":
-        return (Reject(view=view[0], at=view[1:]),), {owner}
     if other in (0, IGNORE_LABEL):
         return (), set()
     edit = Link(op="same" if leaf == other else "different", at=(view, look.place(doubt.other)))
@@ -233,7 +232,7 @@ def _answer_outlines(look: Look, doubt: MaskQuestion) -> tuple[tuple[Edit, ...],
     shown = [_leaf_inside(look, view, outline) for view, outline in doubt.outlines]
     view, outline = doubt.outlines[0]
     no = Reject(view=look.scene.views[view].name, at=look.middle(view, outline), everywhere=doubt.kind == "leaf")
-    if doubt.kind == "missing":
+    if doubt.kind == "place":
         leaf, (share, iou) = look.owner.get(doubt.instance, 0), (0.0, 0.0)
         if leaf:
             share, iou = _overlap(look, view, outline, leaf)

@@ -28,7 +28,7 @@ from mvseg.corrections.corrected import (
     keep_latest,
 )
 from mvseg.corrections.edited_mask import EditedMask, Key, as_table, hang_together, side_of
-from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
+from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, topic_of
 from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
 from mvseg.errors import InputError
@@ -39,6 +39,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
 from mvseg.regions import Regions
 from mvseg.scene import Scene
+from mvseg.traits.stems import StemMark
 
 
 class _Tie(NamedTuple):
@@ -128,8 +129,8 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     edited = _Edited(tuple(EditedMask((0, n), view, masks.regions.placed(n), n, origin)
                            for n, (view, origin) in enumerate(rows)))  # fmt: skip
     for number, edit in enumerate(corrections.edits, start=1):
-        if isinstance(edit, TrackLink):
-            edited = edited.with_fate(Fate(number, edit.op, PASSED))
+        if (topic := topic_of(edit)) != "masks":
+            edited = edited.with_fate(Fate(number, edit.op, APPLIED if topic == "stem" else PASSED))
             continue
         try:
             edited = APPLY[type(edit)](edited.with_fate(Fate(number, edit.op, APPLIED)), number, edit, scene)
@@ -159,10 +160,21 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     )
 
 
+def read_stem_marks(corrections: Corrections | None, scene: Scene) -> dict[int, StemMark | None]:
+    """{number of an edit about a stem: its statement}; None where no view shows its place."""
+    marks: dict[int, StemMark | None] = {}
+    for number, edit in enumerate(() if corrections is None else corrections.edits, start=1):
+        if isinstance(edit, (Reject, Confirm)) and edit.stem:
+            marks[number] = None
+            with suppress(_Lost):
+                marks[number] = StemMark(*_pixel_at(scene, (edit.view, *edit.at)), edit.op == "confirm")
+    return marks
+
+
 def is_on(edit: Edit, regions: Regions, rows: Sequence[int], *, scene: Scene) -> bool:
     """Whether an edit, not an outline, points at one of these masks."""
     places = edit.at if isinstance(edit, Link) else ()
-    if isinstance(edit, (Reject, Confirm, Split)):
+    if isinstance(edit, (Reject, Confirm, Split)) and topic_of(edit) == "masks":
         places = ((edit.view, *edit.at),)
     for place in places:
         with suppress(_Lost):

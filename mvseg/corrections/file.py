@@ -48,21 +48,23 @@ class Outline(_Edit):
 
 
 class Reject(_Edit):
-    """The mask at a point is no leaf; `everywhere`: neither is the instance that it belongs to."""
+    """The mask at a point is no leaf; `everywhere`: neither is its instance; `stem`: the stem nearest to it is none."""
 
     op: Literal["reject"] = "reject"
     view: Text
     at: Point
     everywhere: StrictBool = False
+    stem: StrictBool = False
 
 
 class Confirm(_Edit):
-    """The mask at a point is right as it is; `everywhere`: all masks of its instance are."""
+    """The mask at a point is right as it is; `everywhere`: all of its instance are; `stem`: the nearest stem is."""
 
     op: Literal["confirm"] = "confirm"
     view: Text
     at: Point
     everywhere: StrictBool = False
+    stem: StrictBool = False
 
 
 class Split(_Edit):
@@ -89,6 +91,11 @@ class TrackLink(_Edit):
 
 
 Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(discriminator="op")]
+
+
+def topic_of(edit: Edit) -> Literal["masks", "stem", "dates"]:
+    """Tell what an edit is about."""
+    return "dates" if isinstance(edit, TrackLink) else "stem" if getattr(edit, "stem", False) else "masks"
 
 
 class PhotoMark(BaseModel):

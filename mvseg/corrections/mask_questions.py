@@ -5,28 +5,24 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from typing import Literal
 
 import numpy as np
 import torch
-from scipy.ndimage import find_objects
 
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.corrections.numbers import QUESTIONS
 from mvseg.corrections.rough_outline import trace_outline
 from mvseg.corrections.unmasked import Unmasked, find_unmasked
 from mvseg.formats.photos import ReadPhoto
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import RejectedCandidate
 from mvseg.verification.evidence import Evidence, paint_view, see_instances
 from mvseg.verification.numbers import CHOICE, EVIDENCE
 
-Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
-FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow
-Outlines = tuple[tuple[int, Floats], ...]
+Kind = Literal["place", "leaf", "half"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,39 +30,26 @@ class MaskQuestion:
     """One question to the user.
 
     Attributes:
-        kind: "place": large places have the colour of leaves, and no mask: are there leaves? "half": does a leaf have
-            half masks only? (such places are beside them in several views; or another leaf was missed there);
-            "match": is the mask of that leaf? "unmatched": is it a leaf, and which? "few": is this a leaf? (it was
-            found in few of the views that should show it); "surface": does the mask show that leaf? (the leaf's
-            surface explains it badly); "covered": the leaf should be where a mask of another one is; "missing": it
-            should be where no mask is; "leaf": is this a leaf? (a candidate that was not chosen).
-        doubt: how likely something is wrong, from 0 to 1; rough, to sort by.
+        kind: "place": is there a leaf where no mask is? "leaf": does this mask show that leaf, or any; or, without a
+            mask, is this candidate a leaf? "half": are places without a mask, beside masks of a leaf, halves of it?
+        change: how many usual masks an answer is expected to change; rough, to sort by.
         view: index of the view.
-        instance: id of the leaf; -1 for "unmatched" without a guess, for "place" and "leaf".
-        region: row of the mask; -1 for "place", "missing" and "leaf".
+        instance: id of the leaf; -1 for a candidate, and where any leaf may be shown.
+        region: row of the mask; -1 without one.
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
-        num_found, num_expected: views that have a mask of the leaf, and that should; of "half", those that have half
-            a mask, and that have any.
-        size: area of its place, relative to a usual mask, at most 1.
-        outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
-            "missing", two or more of "leaf", those of "place" and "half", none of the others.
+        num_found, num_expected: views that have a mask of the leaf, and that should.
+        outlines: views, `view` first, and (P, 2) float64 pixels, undistorted, where leaves may be that have no mask.
     """
 
     kind: Kind
-    doubt: float
+    change: float
     view: int
-    instance: int
+    instance: int = -1
     region: int = -1
     other: int = -1
     num_found: int = 0
     num_expected: int = 0
-    outlines: Outlines = ()
-    size: float = 1.0
-
-    @property
-    def change(self) -> float:
-        """How many usual masks an answer is expected to change."""
-        return round(self.doubt * self.size * max(1, self.num_found, len(self.outlines)), QUESTIONS.digits)
+    outlines: tuple[tuple[int, Floats], ...] = ()
 
 
 def list_mask_questions(
@@ -77,51 +60,46 @@ def list_mask_questions(
     rejected: Sequence[RejectedCandidate] = (),
     photos: ReadPhoto | None = None,
 ) -> list[MaskQuestion]:
-    """List questions about masks, at most `QUESTIONS.most`: first places without masks and half masks, then those whose
-    answer is expected to change most (`MaskQuestion.change`). Masks that the user made or confirmed are not asked
-    about, and every other mask once.
-
-    Args:
-        surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
-        photos: photos of the views; None: nobody looks for places without masks.
+    """List questions about masks, at most `QUESTIONS.most`; those whose answer is expected to change most come first.
+    Each leaf and each mask is asked about once, and no mask that the user made, confirmed or linked. Without `surfaces`
+    (by instance id), only matching is doubted; without `photos`, nobody looks for large places without masks.
     """
     masks, surfaces_of, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
-    usual, areas = _usual_area(masks), masks.regions.areas.tolist()
-    questions = _ask_matches(masks, usual)
-    should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
+    matched = masks.regions.areas[masks.instance_ids > 0].float()
+    usual = max(float(matched.median()), 1.0) if len(matched) else 1.0
+    size = (masks.regions.areas / usual).clamp(max=1).tolist()
     evidence = see_instances(masks.regions, surfaces_of, cameras)
-    free: list[list[int]] = [[] for _ in rejected]  # rows of each candidate's masks where none of the result lies
-    for view, size in enumerate(cameras.sizes.tolist() if surfaces_of or rejected else ()):
-        taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
-        if surfaces_of:
-            painted = paint_view(surfaces_of, cameras, view)
-            questions += _ask_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
-        for rows, candidate in zip(free, rejected, strict=True):
-            rows += _free_rows(candidate.masks, view, taken)
-    questions += _ask_surfaces(masks, surfaces_of) + _ask_rare(masks, should)
+    has_mask, should = np.zeros((2, masks.num_instances + 1, masks.regions.num_views), bool)
+    has_mask[masks.instance_ids.clamp(min=0), masks.view_index] = True
+    should[: evidence.share.shape[1]] = QUESTIONS.open <= evidence.share.T
+    # Without a credible surface, all views should show a leaf.
+    num_views = [has_mask.sum(1), np.where(should.any(1), (has_mask | should).sum(1), has_mask.shape[1])]
+    questions, is_taken = [], list[Bools]()
+    for view, shape in enumerate(cameras.sizes.tolist() if surfaces_of or rejected else ()):
+        is_taken.append(masks.regions.label_map(view, torch.ones_like(masks.instance_ids), shape).numpy() > 0)
+        if len(absent := np.flatnonzero(should[:, view] & ~has_mask[:, view])):
+            painted = np.where(is_taken[view], -1, 1) * paint_view(surfaces_of, cameras, view)
+            questions += _ask_absent(masks, absent, painted, view=view, evidence=evidence, usual=usual)
+    questions += _ask_masks(masks, surfaces_of, num_views, size=size) + _ask_rejected(rejected, is_taken, usual=usual)
     if photos is not None:
         questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=QUESTIONS.half * usual), usual=usual)
-    questions = [
-        replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in questions
-    ]
-    is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
-    asked: set[tuple[int, ...]] = set()
-    queue = _ask_rejected(rejected, free, usual=usual)
-    place = attrgetter("view", "instance", "region")
-    for each in sorted(questions, key=lambda one: (*_order(one), one.instance < 0, *place(one))):
-        name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
-        if each.doubt >= QUESTIONS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
-            asked.add(name)
-            queue.append(each)
-    queue.sort(key=_order)
-    return [
-        each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
-        for each in queue[: QUESTIONS.most]
-    ]
+    is_settled, asked, queue = (masks.is_corrected | masks.is_linked).tolist(), set[tuple[str, int]](), []
+    for each in sorted(questions, key=_order):
+        if each.kind == "leaf" and each.region >= 0:
+            names = {("mask", each.region), ("leaf", each.instance)} - {("leaf", -1)}
+            if is_settled[each.region] or names & asked:
+                continue
+            asked |= names
+        if each.instance > 0:
+            found, expected = (int(number[each.instance]) for number in num_views)
+            other = best_mask(masks, each.instance, but=each.view)
+            each = replace(each, other=other, num_found=found, num_expected=expected)
+        queue.append(each)
+    return queue[: QUESTIONS.most]
 
 
-def _order(question: MaskQuestion) -> tuple[bool, float]:
-    return question.kind not in FIRST, -question.change
+def _order(question: MaskQuestion) -> tuple[float, bool, int, int]:
+    return -round(question.change, QUESTIONS.digits), question.instance < 0, question.view, question.instance
 
 
 def best_mask(masks: Masks, instance: int, *, but: int) -> int:
@@ -134,21 +112,25 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
     return int(rows[torch.where(scores >= scores.max() - QUESTIONS.as_good, masks.regions.areas[rows], -1).argmax()])
 
 
-def _ask_matches(masks: Masks, usual: float) -> list[MaskQuestion]:
-    ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
-    questions = []
-    for row, score in enumerate(masks.match_scores.tolist()):
-        if ids[row] > 0:
-            questions.append(MaskQuestion("match", 1 - score, views[row], ids[row], region=row))
-        elif areas[row] > 0:
-            doubt = min(1.0, float(areas[row]) / usual)
-            questions.append(MaskQuestion("unmatched", doubt, views[row], -1, region=row))
+def _ask_masks(
+    masks: Masks, surfaces: Mapping[int, LeafSurface], num_views: Sequence[Ints], *, size: Sequence[float]
+) -> list[MaskQuestion]:
+    """Ask about masks of no leaf, masks that score low or that the leaf's surface explains badly, and the masks of
+    leaves with masks in few of the views that should show them: such a leaf may be none in any view."""
+    questions, ids = [], masks.instance_ids.tolist()
+    certain = {*masks.instance_ids[masks.is_corrected | masks.is_linked].tolist(), -1}
+    wrong = torch.where(masks.instance_ids > 0, 1 - masks.match_scores, torch.tensor(size)).tolist()
+    for instance, surface in surfaces.items():
+        fits = dict(zip(surface.views.tolist(), surface.iou.nan_to_num(1.0).tolist(), strict=True))
+        for row in (masks.instance_ids == instance).nonzero()[:, 0].tolist():
+            wrong[row] = max(wrong[row], 1 - fits.get(int(masks.view_index[row]), 1.0))
+    for row, view in enumerate(masks.view_index.tolist()):
+        num_found, num_expected = (int(number[ids[row]]) for number in num_views)
+        few = 0.0 if ids[row] in certain else 1 - num_found / num_expected
+        if max(wrong[row], few) >= QUESTIONS.least:
+            change = max(wrong[row], few * num_found) * size[row]
+            questions.append(MaskQuestion("leaf", change, view, ids[row], region=row))
     return questions
-
-
-def _usual_area(masks: Masks) -> float:
-    matched = masks.regions.areas[masks.instance_ids > 0].float()
-    return max(float(matched.median()), 1.0) if len(matched) else 1.0
 
 
 def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> list[MaskQuestion]:
@@ -169,34 +151,27 @@ def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> l
         places = [part for part in places if part.row < 0 or ids[part.row] != instance]
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
-        num_all = len(masks.view_index[masks.instance_ids == instance].unique())
-        half = MaskQuestion("half", 1.0, largest.view, instance, region=largest.row, outlines=outlines)
-        questions.append(replace(half, num_found=len(views), num_expected=num_all))
+        change = len(views) * min(1.0, areas[largest.row] / usual)
+        questions.append(MaskQuestion("half", change, largest.view, instance, largest.row, outlines=outlines))
     if len({part.view for part in places}) > 1:  # two outlines are a leaf
         outlines = tuple((part.view, part.outline) for part in places[: QUESTIONS.most_places])
-        questions.append(MaskQuestion("place", 1.0, outlines[0][0], -1, outlines=outlines))
+        questions.append(MaskQuestion("place", len(outlines), outlines[0][0], outlines=outlines))
     return questions
 
 
-def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
-    free = []
-    for row in (masks.view_index == view).nonzero()[:, 0].tolist():
-        crop = masks.regions.placed(row)
-        if float(crop.cut(taken)[crop.pixels.numpy()].mean()) <= EVIDENCE.shared:
-            free.append(row)
-    return free
-
-
 def _ask_rejected(
-    rejected: Sequence[RejectedCandidate], free: Sequence[Sequence[int]], *, usual: float
+    rejected: Sequence[RejectedCandidate], is_taken: Sequence[Bools], *, usual: float
 ) -> list[MaskQuestion]:
-    """Candidates that were not chosen, in the views where no mask of the result lies, the largest mask first; `usual`
-    as `_usual_area` says."""
+    """Ask about candidates that were not chosen, in views where no mask of the result lies (`is_taken`, (H, W))."""
     questions = []
-    for each, rows in zip(rejected, free, strict=True):
+    for each in rejected:
+        regions, rows = each.masks.regions, list[int]()
+        for row, view in enumerate(regions.view_index.tolist()):
+            crop = regions.placed(row)
+            if float(crop.cut(is_taken[view])[crop.pixels.numpy()].mean()) <= EVIDENCE.shared:
+                rows.append(row)
         if each.chance < QUESTIONS.least_chance or len(rows) < CHOICE.least_views:
             continue
-        regions = each.masks.regions
         areas = regions.areas[rows].double()
         order = areas.argsort(descending=True, stable=True).tolist()
         outlines = tuple(
@@ -204,67 +179,27 @@ def _ask_rejected(
             for row in (rows[place] for place in order)
         )
         doubt = each.chance * min(1.0, float(areas.median()) / usual)
-        questions.append(MaskQuestion("leaf", doubt, outlines[0][0], -1, outlines=outlines))
+        questions.append(MaskQuestion("leaf", doubt * len(outlines), outlines[0][0], outlines=outlines))
     return questions
 
 
-def _ask_view(
-    masks: Masks, painted: Ints, should: Bools, *, view: int, taken: Bools, evidence: Evidence
+def _ask_absent(
+    masks: Masks, absent: Ints, painted: Ints, *, view: int, evidence: Evidence, usual: float
 ) -> list[MaskQuestion]:
-    """Questions about leaves that one view should show and does not.
-
-    `should` (K + 1, V) gets True where it should show one; `painted` (H, W) is from `paint_view`, `taken` (H, W) is
-    True in masks, the columns of `evidence` are ids.
-    """
+    """Ask about leaves (`absent`, ids) that one view should show and does not: is it a mask that lies there, or is no
+    mask there? `painted` (H, W) is from `paint_view`, negative in masks."""
     members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
-    here = {int(masks.instance_ids[row]) for row in members}
     questions = []
-    for instance, box in enumerate(find_objects(painted, max_label=len(should) - 1), 1):
-        if box is None:
-            continue
-        mask, share = painted[box] == instance, float(evidence.share[view, instance])
-        if share < QUESTIONS.open or mask.sum() < EVIDENCE.open_pixels:
-            continue
-        should[instance, view] = True
-        if instance in here:
-            continue
-        empty = float((mask & ~taken[box]).sum() / mask.sum())
+    for instance in absent.tolist():
+        mask = np.abs(painted) == instance
         nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
+        if mask.sum() < EVIDENCE.open_pixels:
+            continue
         if nearest >= 0 and evidence.visible[nearest, instance] >= QUESTIONS.similar:
-            doubt = min(1.0, float(evidence.visible[nearest, instance]) / QUESTIONS.surely)
-            questions.append(MaskQuestion("covered", doubt, view, instance, region=nearest))
-        elif empty >= QUESTIONS.empty:
-            outlines = ((view, trace_outline(mask) + (box[1].start, box[0].start)),)
-            size = min(1.0, float(mask.sum()) / _usual_area(masks))
-            questions.append(MaskQuestion("missing", empty * share, view, instance, outlines=outlines, size=size))
-    return questions
-
-
-def _ask_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[MaskQuestion]:
-    questions = []
-    for instance, surface in surfaces.items():
-        if not surface.exists:
-            continue
-        worst = int(surface.iou.nan_to_num(1.0).argmin())
-        view, doubt = int(surface.views[worst]), 1 - float(surface.iou[worst].nan_to_num(1.0))
-        rows = ((masks.instance_ids == instance) & (masks.view_index == view)).nonzero()[:, 0]
-        if len(rows):
-            row = int(rows[masks.regions.areas[rows].argmax()])
-            questions.append(MaskQuestion("surface", doubt, view, instance, region=row))
-    return questions
-
-
-def _ask_rare(masks: Masks, should: Bools) -> list[MaskQuestion]:
-    """Leaves that were found in few of the views that should show them; without a credible surface, of all views."""
-    questions = []
-    for instance in range(1, masks.num_instances + 1):
-        best = best_mask(masks, instance, but=-1)
-        if best < 0:
-            continue
-        views = set(masks.view_index[masks.instance_ids == instance].tolist())
-        expected = views | set(np.flatnonzero(should[instance]).tolist())
-        number = len(expected) if should[instance].any() else masks.regions.num_views
-        doubt, view = 1 - len(views) / number, int(masks.view_index[best])
-        few = MaskQuestion("few", doubt, view, instance, region=best)
-        questions.append(replace(few, num_found=len(views), num_expected=number))
+            change = float(evidence.visible[nearest, instance]) * min(1.0, float(masks.regions.areas[nearest]) / usual)
+            questions.append(MaskQuestion("leaf", change, view, instance, region=nearest))
+        elif (empty := float((painted == instance).sum() / mask.sum())) >= QUESTIONS.empty:
+            shown = float(evidence.share[view, instance]) * min(1.0, float(mask.sum()) / usual)
+            outlines = ((view, trace_outline(mask)),)
+            questions.append(MaskQuestion("place", empty * shown, view, instance, outlines=outlines))
     return questions

@@ -43,7 +43,6 @@ class QuestionNumbers:
     open: float = 0.5  # chosen: unhidden share of a surface that should have a mask; see `EVIDENCE.open_pixels`
     empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one
-    surely: float = 0.8  # chosen: the same, from which nothing else is likelier
     least_chance: float = 0.1  # chosen: P from which a candidate that was not chosen is asked about
     half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
     least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf

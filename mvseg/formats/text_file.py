@@ -17,7 +17,7 @@ from mvseg.errors import InputError
 from mvseg.system.atomic import write_text_whole
 
 MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26  # limit: bytes of a file, and of a table
-ALIAS = yaml.AliasEvent
+DEEPEST = 100  # limit: of lists and mappings in one another, in YAML
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 Cell = str | float | None
@@ -110,8 +110,13 @@ def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> An
     lines = read_text(path, expected).split("\n")
     text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
     try:
-        if alias := next((each for each in yaml.parse(text, Loader=yaml.SafeLoader) if isinstance(each, ALIAS)), None):
-            raise ValueError(f"line {alias.start_mark.line + 1} has the alias *{alias.anchor}, expected plain values")
+        depth = 0
+        for each in yaml.parse(text, Loader=yaml.SafeLoader):
+            depth += isinstance(each, yaml.CollectionStartEvent) - isinstance(each, yaml.CollectionEndEvent)
+            if isinstance(each, yaml.AliasEvent):
+                raise ValueError(f"line {each.start_mark.line + 1} has the alias *{each.anchor}, expected plain values")
+            if depth > DEEPEST:  # yaml takes minutes to find that it cannot hold it
+                raise ValueError(f"line {each.start_mark.line + 1} is nested more than {DEEPEST} times")
         return yaml.load(text, loader)
     except Exception as error:  # yaml raises its own kinds, and those of its builders
         raise InputError(f"{path}: is not a YAML file ({' '.join(str(error).split())}), expected {expected}") from None

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvseg.corrections.apply import apply
 from mvseg.corrections.corrected import Corrected, apply_everywhere
-from mvseg.corrections.file import Corrections
+from mvseg.corrections.file import Corrections, topic_of
 from mvseg.corrections.linked_halves import link_halves
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding
@@ -32,6 +32,8 @@ def apply_edits(plant: Plant, corrections: Corrections | None) -> Plant:
     opened, cameras, editable = plant.opened, plant.scene.cameras, plant.editable.to("cpu")
     with timed("correct"):
         corrected = apply(corrections, editable, plant.scene)
+        if not any(topic_of(edit) == "masks" for edit in corrections.edits):
+            return replace(plant, edits=corrected.fates)
         before = plant.ids_of(corrected.masks)
         corrected = link_halves(corrected, before, cameras.to("cpu"))
         stays = torch.isin(before, unchanged_leaves(corrected, before, plant.masks.to("cpu")))

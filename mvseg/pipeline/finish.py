@@ -7,7 +7,9 @@ from dataclasses import replace
 
 from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
-from mvseg.corrections.corrected import APPLIED, Fate, RejectedPixel
+from mvseg.corrections.apply import read_stem_marks
+from mvseg.corrections.corrected import APPLIED, NOTHING, Fate, RejectedPixel
+from mvseg.corrections.file import Corrections
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.findings.finding import Finding, Values, keep_causes
@@ -137,8 +139,8 @@ def _find_doubtful(surfaces: Mapping[int, LeafSurface], stems: Sequence[int]) ->
     return Finding("doubtful_shapes", values=values, level="note")
 
 
-def measure(result: Result, config: RunConfig) -> Result:
-    """Add voxels, and traits of the leaves and of the plant, see `measure_plant`; nothing without shapes."""
+def measure(result: Result, config: RunConfig, corrections: Corrections | None = None) -> Result:
+    """Add voxels and traits (`measure_plant`); nothing without shapes. Warns (InputWarning) of edits about no stem."""
     if config.reconstruct is None:
         return result
     from mvseg.reconstruction.shapes import reconstruct_voxels
@@ -147,6 +149,7 @@ def measure(result: Result, config: RunConfig) -> Result:
     regions, ids, cameras = result.masks.regions, result.masks.instance_ids, result.scene.cameras
     with timed("voxels"):
         voxels = reconstruct_voxels(regions, ids, cameras, config=config.reconstruct, surfaces=result.surfaces)
+    marks = read_stem_marks(corrections, result.scene)
     with timed("measure"):
         traits = measure_plant(
             result.scene,
@@ -157,5 +160,12 @@ def measure(result: Result, config: RunConfig) -> Result:
             config=config.traits,
             stems=_stems_of(result, config),
             probabilities=result.instances.probabilities,
+            stem_marks=[mark for mark in marks.values() if mark is not None],
         )
-    return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits))
+    fates = list(result.fates)
+    for number, mark in marks.items():
+        if mark is None or (mark.is_stem and not traits.stems):
+            lost = fates[number - 1] = replace(fates[number - 1], fate=NOTHING, problem="there is no stem")
+            if lost.finding is not None:
+                warn(lost.finding)
+    return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits), fates=tuple(fates))

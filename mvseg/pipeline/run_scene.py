@@ -69,12 +69,12 @@ def run_scene(
                 plant = learn(plant, cache=detections, corrections=corrections)
                 detections.delete_others()
         edited, before = apply_edits(plant, corrections), None
-        if edited.edits:
+        if edited.matching is not plant.matching:
             with collect_warnings():  # of masks that nobody sees any more
                 before = shape_leaves(plant).surfaces
         result = shape_leaves(edited, same_segmenter=before)
         result = check_result(result, edited)
-        result = measure(result, config)
+        result = measure(result, config, corrections)
         packed = pack_plant(plant, findings_before)
     findings = keep_causes((*noticed, *result.findings))
     return replace(result, findings=findings, corrections=corrections, before_edits=packed, seconds=now.seconds)

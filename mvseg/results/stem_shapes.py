@@ -41,10 +41,10 @@ def parts_of(result: Result) -> list[StemPart]:
 
 
 def stem_parts(stem: Stem) -> Iterator[StemPart]:
-    """A stem, as thick as masks show it, and thin straight tubes from its nodes to the blades: petioles are guessed."""
-    length = max(stem.axis.length, 1e-300)
-    radius = stem.axis.radius if stem.axis.radius.any() else np.full(len(stem.axis.points), STEM_WIDTH * length)
-    yield StemPart(f"stem_{stem.number}", None, stem.axis.points, radius, STEM_COLOR, stem.probability < SURE_STEM)
+    """A stem to its outer nodes at least, as thick as masks show it, and thin tubes to the blades: guessed petioles."""
+    axis, length = stem.axis.reach([node.place for node in stem.nodes]), max(stem.axis.length, 1e-300)
+    radius = axis.radius if axis.radius.any() else np.full(len(axis.points), STEM_WIDTH * length)
+    yield StemPart(f"stem_{stem.number}", None, axis.points, radius, STEM_COLOR, stem.probability < SURE_STEM)
     for node in stem.nodes:
         ends = np.array([node.place, node.base])
         if np.linalg.norm(ends[1] - ends[0]) > PETIOLE_WIDTH * length:

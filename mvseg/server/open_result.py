@@ -156,7 +156,8 @@ class OpenResult:
         plant, noticed = self._now
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(plant, corrections)
-            result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if edited.edits else None)
+            is_changed = edited.matching is not plant.matching
+            result = shape_leaves(edited, same_segmenter=self._fit_before(plant) if is_changed else None)
         previous, _ = self._newest or self._saved_page
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers, previous.masks)
         told = {"edit", *(each.get("code") for each in self.run.record.findings)}

@@ -141,8 +141,9 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
             observation = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
             if leaf.leaf in nodes:
                 stem, node = nodes[leaf.leaf]
-                measured = {"internode": (node.internode, traits.unit), "divergence": (node.divergence, "degree")}
-                numbers = {name: Number(m.value, m.sd, unit) for name, (m, unit) in measured.items() if m.exists}
+                units = {"internode": traits.unit, "divergence": "degree", "node_azimuth": "degree"}
+                measured = {name: getattr(node, name) for name in units}
+                numbers = {name: Number(m.value, m.sd, units[name]) for name, m in measured.items() if m.exists}
                 observation = replace(observation, numbers={**observation.numbers, **numbers}, node=(stem, node.number))
             leaves.append(replace(observation, is_doubted=leaf.rejection is not None))
     return PlantOnDate(

@@ -13,17 +13,18 @@ from typing import Any
 
 import numpy as np
 
+from mvseg.arrays import Floats
 from mvseg.results.overlay import instance_color
 from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
-from mvseg.tracking.dates import Number
+from mvseg.tracking.dates import Number, SeenLeaf
 from mvseg.tracking.growth import Growth
 from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
 ASSETS = files("mvseg.tracking") / "assets"
-SHARED_SCRIPTS = ("selection.js", "figures.js")  # with the page of a result
+SHARED_SCRIPTS = ("selection.js", "figures.js", "stems.js")  # with the page of a result
 SERVED_SCRIPTS = ("numbers.js", "edits.js", "server.js")  # of the page that corrects a result
 
 
@@ -84,10 +85,11 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
                  "state": row.state, "flat": "length" in leaf.numbers,
                  "crop": base64.b64encode(picture.jpeg).decode("ascii") if picture else "",
                  "place": [picture.view, *picture.at] if picture else None,
-                 "shape": np.round(placed).astype(int).ravel().tolist()}
+                 "shape": np.round(placed).astype(int).ravel().tolist(), "node": _describe_node(leaf, pose)}
             )  # fmt: skip
     return {
         "plant": tracks.plant,
+        "unit": tracks.dates[0].unit or "world unit",
         "dates": [
             {name: getattr(date, name) for name in ("scene", "time", "written")}
             | {"photo": base64.b64encode(date.photo).decode("ascii")}
@@ -102,6 +104,16 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         "numbers": _describe_numbers((each.trait, each.track, each.date, each.number) for each in growth.points),
         "whole": _describe_plant(growth),
     }
+
+
+def _describe_node(leaf: SeenLeaf, pose: Floats) -> dict[str, Any] | None:
+    """The place of a leaf on its stem on one date; azimuths as the pot stood on the first one."""
+    if leaf.node is None or "node_height" not in leaf.numbers:
+        return None
+    height, azimuth = leaf.numbers["node_height"], leaf.numbers.get("node_azimuth")
+    turn = math.degrees(math.atan2(pose[1, 0], pose[0, 0]))
+    place = {"azimuth": None if azimuth is None else _round((azimuth.value + turn) % 360, 4)}
+    return place | {"stem": leaf.node[0], "node": leaf.node[1], "height": height.value, "sd": _round(height.sd, 3) or 0}
 
 
 def _describe_plant(growth: Growth) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from itertools import chain
 from types import MappingProxyType
@@ -27,11 +27,11 @@ from mvseg.traits.leaf import NEED_UP, Measurement, measure_area, measure_leaf, 
 from mvseg.traits.nodes import NODE_COLUMNS, NODE_NUMBERS, Stem
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, unit_of
 from mvseg.traits.plant import measure_whole
-from mvseg.traits.stems import axes_of_masks, find_stems, up_of_stem
+from mvseg.traits.stems import StemMark, axes_of_masks, find_stems, judge_stems, up_of_stem
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
-TILT_DEG = 10.0  # fitted: python benchmarks/stems.py --cache DIR --up; root mean square of stems against up
+TILT_DEG = 10.0  # fitted: python benchmarks/stems.py --cache DIR --up; root mean square of lobed plants
 NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
 GOOD = "good"
 USELESS = {"poor_fit"}  # codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each
@@ -157,6 +157,7 @@ def measure_plant(
     config: TraitsConfig = TraitsConfig(),
     stems: Collection[int] = (),
     probabilities: Mapping[int, float] = MappingProxyType({}),
+    stem_marks: Sequence[StemMark] = (),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves; on the CPU, wherever the inputs are.
 
@@ -166,6 +167,7 @@ def measure_plant(
         photos: of the scene; None: they are read.
         stems: ids of instances that are stems, as the user says.
         probabilities: {instance id: how likely it is a leaf}, where the views chose it.
+        stem_marks: statements of the user about stems, see `judge_stems`.
 
     Returns:
         The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
@@ -190,6 +192,7 @@ def measure_plant(
         ids = sorted(instance for instance, each in rejected.items() if each.kind == "stem")
         of_masks = axes_of_masks({stem: surfaces[stem] for stem in ids if surfaces and stem in surfaces})
         plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, of_masks=of_masks)
+        plant_stems = judge_stems(plant_stems, stem_marks, scene.cameras)
     tilt_deg = 0.0
     if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
         frame, tilt_deg = level_frame(up), TILT_DEG

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy.special import expit
 
 from mvseg.arrays import Floats
@@ -90,6 +92,31 @@ def find_stems(
         return ()
     stems = _of_path(path, surfaces, frame, upward, chance)
     return stems if upward is None else tuple(stem for stem in stems if _rises(stem.axis, upward))
+
+
+class StemMark(NamedTuple):
+    """Statement of the user: the stem drawn nearest to a pixel of a view is one, or is none."""
+
+    view: int
+    column: int
+    row: int
+    is_stem: bool
+
+
+def judge_stems(stems: Sequence[Stem], marks: Sequence[StemMark], cameras: Cameras) -> tuple[Stem, ...]:
+    """The stems; those that the user confirms are certain, those that the user rejects go. Later statements hold."""
+    verdicts: dict[int, bool] = {}
+    for mark in marks if stems else ():
+        gaps = {stem.number: _gap_in_view(stem.axis, mark, cameras) for stem in stems}
+        verdicts[min(gaps, key=lambda number: gaps[number])] = mark.is_stem
+    judged = (replace(stem, probability=1.0) if stem.number in verdicts else stem for stem in stems)
+    return tuple(stem for stem in judged if verdicts.get(stem.number, True))
+
+
+def _gap_in_view(axis: StemAxis, mark: StemMark, cameras: Cameras) -> float:
+    """Distance between a marked pixel and the line of a stem in its view, pixels."""
+    xy, depth = cameras[[mark.view]].to("cpu").project(torch.from_numpy(axis.points))
+    return float((xy[0] - torch.tensor([mark.column, mark.row])).norm(dim=1).where(depth[0] > 0, torch.inf).min())
 
 
 def find_upward(cameras: Cameras) -> Floats | None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import apply
+from mvseg.corrections.apply import apply, read_stem_marks
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.findings.finding import Finding
@@ -62,6 +62,15 @@ def at(op: str, x: float, y: float, view: str = "a", **more: Any) -> dict[str, A
 
 def link(op: str, *places: tuple[str, float, float]) -> dict[str, Any]:
     return {"op": op, "at": [list(place) for place in places]}
+
+
+def test_an_edit_about_a_stem_changes_no_mask() -> None:
+    edits = [*(at(op, 15, 15, stem=True) for op in ("reject", "confirm")), at("reject", 1, 1, "c", stem=True)]
+    marks = read_stem_marks(parse_corrections({"format": FORMAT, "edits": edits}), SCENE)
+    assert marks == {1: (0, 15, 15, False), 2: (0, 15, 15, True), 3: None}
+    corrected = correct(*edits)
+    assert torch.equal(corrected.masks.regions.crops, MASKS.regions.crops)
+    assert not corrected.masks.is_corrected.any()
 
 
 def test_an_outline_replaces_what_it_covers_by_more_than_half() -> None:

@@ -39,7 +39,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         Link(op="same", at=(("003", 1, 2), ("007", 3, 4))),
         Link(op="different", at=(("003", 1, 2), ("003", 3, 4))),
         Split(view="a/b", at=(1, 2), line=((0, 0), (5, 5))),
-        Confirm(view="003", at=(0.5, 0.5)),
+        Confirm(view="003", at=(0.5, 0.5), stem=True),
         TrackLink(op="same_track", at=(("day1", "003", 1, 2), ("day2", "003", 1, 2))),
     )
     path = tmp_path / "corrections.json"

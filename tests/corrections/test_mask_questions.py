@@ -42,17 +42,13 @@ def changed(view: int, leaf: int, number: int) -> Masks:
     return masks_of(maps)
 
 
-def test_nothing_is_asked_of_a_result_without_faults() -> None:
-    assert doubts(masks_of(TRUE)) == []
-
-
 def test_low_scores_come_first_the_lowest_before_the_others() -> None:
     masks = masks_of(TRUE)
-    rows = [row_of(masks, view=view, leaf=leaf) for view, leaf in ((1, 2), (4, 3), (0, 1))]
-    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - QUESTIONS.least + 0.01])
+    rows = [row_of(masks, view=view, leaf=leaf) for view, leaf in ((1, 2), (4, 3), (0, 1), (2, 3))]
+    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - QUESTIONS.least + 0.01, 0.3])
     found = doubts(masks)
     assert [(each.kind, each.view, each.instance, each.region) for each in found] == [
-        ("match", 4, 3, rows[1]), ("match", 1, 2, rows[0])
+        ("leaf", 4, 3, rows[1]), ("leaf", 1, 2, rows[0])
     ]  # fmt: skip
     for each in found:  # what it is compared with shows the same leaf elsewhere
         assert masks.instance_ids[each.other] == each.instance
@@ -61,7 +57,8 @@ def test_low_scores_come_first_the_lowest_before_the_others() -> None:
 
 def test_a_missing_mask_is_proposed_where_the_surface_is_seen() -> None:
     (found,) = doubts(changed(2, 1, 0))
-    assert (found.kind, found.view, found.instance, found.region) == ("missing", 2, 1, -1)
+    assert (found.kind, found.view, found.instance, found.region) == ("place", 2, 1, -1)
+    assert found.num_found == found.num_expected - 1
     ((view, outline),) = found.outlines
     assert view == 2
     drawn = cv2.fillPoly(np.zeros(TRUE[2].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
@@ -69,18 +66,15 @@ def test_a_missing_mask_is_proposed_where_the_surface_is_seen() -> None:
     assert (drawn & true).sum() / (drawn | true).sum() > 0.9
 
 
-def test_a_mask_of_another_leaf_in_the_place_is_asked_about() -> None:
+def test_a_mask_of_no_leaf_may_be_the_leaf_that_should_be_there_or_none() -> None:
     masks = changed(2, 1, 100)
     (found,) = doubts(masks)
     lone = int((masks.instance_ids == -1).nonzero()[0])
-    assert (found.kind, found.view, found.instance, found.region) == ("covered", 2, 1, lone)
-
-
-def test_a_mask_far_from_all_leaves_may_be_none() -> None:
+    assert (found.kind, found.view, found.instance, found.region) == ("leaf", 2, 1, lone)
     maps = [labels.copy() for labels in TRUE]
     maps[1][:40, :40] = np.where(maps[1][:40, :40] == 0, 100, maps[1][:40, :40])
     (found,) = doubts(masks_of(maps))
-    assert (found.kind, found.view, found.instance, found.other) == ("unmatched", 1, -1, -1)
+    assert (found.kind, found.view, found.instance, found.other) == ("leaf", 1, -1, -1)
     maps[1][:40, :40] = np.where(maps[1][:40, :40] == 100, 0, maps[1][:40, :40])
     maps[1][:3, :3] = 100
     assert doubts(masks_of(maps)) == []  # a crumb
@@ -88,42 +82,44 @@ def test_a_mask_far_from_all_leaves_may_be_none() -> None:
 
 def test_a_leaf_of_few_views_is_asked_about_once() -> None:
     maps = [np.where((labels == 3) & (view != 0), 0, labels) for view, labels in enumerate(TRUE)]
-    few = [each for each in doubts(masks_of(maps)) if each.kind == "few"]
+    few = [each for each in doubts(masks_of(maps)) if each.kind == "leaf"]
     whole = [int(mask.sum()) for mask in LEAVES[3].project(CAMERAS)]
     openly = sum((labels == 3).sum() >= 0.5 * size for labels, size in zip(TRUE, whole, strict=True))
     assert [(each.instance, each.view, each.num_found, each.num_expected) for each in few] == [(3, 0, 1, openly)]
-    assert few[0].doubt == pytest.approx(1 - 1 / openly)
-
-
-def test_without_surfaces_every_view_should_show_a_leaf() -> None:
-    maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
-    found = list_mask_questions(masks_of(maps), None, cameras=CAMERAS)
-    assert [(each.kind, each.instance, each.num_found, each.num_expected) for each in found] == [("few", 3, 2, 6)]
+    masks = masks_of(maps)
+    masks.match_scores[row_of(masks, view=4, leaf=2)] = 0.6
+    first, second = list_mask_questions(masks, None, cameras=CAMERAS)  # the larger change first
+    assert (first.instance, first.num_found, first.num_expected) == (3, 1, 6)  # without surfaces, every view should
+    assert second.instance == 2
 
 
 def test_the_mask_that_its_surface_explains_worst_is_asked_about() -> None:
     iou = torch.full((6,), 0.9, dtype=torch.float64)
-    iou[4] = 0.4
+    iou[[3, 4]] = torch.tensor([0.6, 0.4], dtype=torch.float64)
     surfaces = LEAVES | {2: replace(make_surface(LEAVES[2].coefficients.numpy()), iou=iou)}
     masks = masks_of(TRUE)
     (found,) = list_mask_questions(masks, surfaces, cameras=CAMERAS)
-    assert (found.kind, found.view, found.region) == ("surface", 4, row_of(masks, view=4, leaf=2))
-    assert found.doubt == pytest.approx(0.6)
+    assert (found.kind, found.view, found.region) == ("leaf", 4, row_of(masks, view=4, leaf=2))
 
 
-def test_what_a_person_said_is_not_asked_again() -> None:
+@pytest.mark.parametrize("is_drawn", [True, False])
+def test_what_a_person_said_is_not_asked_again(is_drawn: bool) -> None:
     masks = masks_of(TRUE)
-    row = row_of(masks, view=1, leaf=2)
-    masks.match_scores[row] = 0.1
-    assert [each.region for each in doubts(masks)] == [row]
-    masks.origin[row] = int(Origin.CORRECTED)
+    rows = [row_of(masks, view=view, leaf=2) for view in (1, 2)]
+    masks.match_scores[rows] = torch.tensor([0.1, 0.2])
+    for row in rows:  # the next mask of the leaf follows
+        assert [each.region for each in doubts(masks)] == [row]
+        if is_drawn:
+            masks.origin[row] = int(Origin.CORRECTED)
+        masks.is_linked[row] = not is_drawn
     assert doubts(masks) == []
 
 
-def test_no_masks_and_no_surfaces_are_no_doubts() -> None:
+def test_nothing_is_asked_of_a_result_without_faults_masks_or_surfaces() -> None:
+    assert doubts(masks_of(TRUE)) == []
     empty = masks_of([np.zeros_like(labels) for labels in TRUE])
     assert list_mask_questions(empty, None, cameras=CAMERAS) == []
-    assert {each.kind for each in list_mask_questions(masks_of(TRUE), {}, cameras=CAMERAS)} == set()
+    assert list_mask_questions(masks_of(TRUE), {}, cameras=CAMERAS) == []
 
 
 def leave_out(leaf: int, chance: float, *views: int) -> RejectedCandidate:
@@ -140,10 +136,10 @@ def without(leaf: int) -> Masks:
 def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
     surfaces = {1: LEAVES[1], 2: LEAVES[3]}
     found = list_mask_questions(without(2), surfaces, cameras=CAMERAS, rejected=(leave_out(2, 0.4, 0, 2, 4),))
-    (asked,) = [each for each in found if each.kind == "leaf"]
+    (asked,) = [each for each in found if each.region < 0]
     assert sorted(view for view, _ in asked.outlines) == [0, 2, 4]
     assert (asked.view, asked.region, asked.instance) == (asked.outlines[0][0], -1, -1)
-    assert 0 < asked.doubt <= 0.4
+    assert 0 < asked.change <= 0.4 * 3
     for view, outline in asked.outlines:
         drawn = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
         true = TRUE[view] == 2
@@ -167,7 +163,7 @@ def test_large_places_that_look_like_leaves_come_first() -> None:
     read = [photo.astype(np.uint8) for photo in photos].__getitem__
     first, *others = list_mask_questions(masks, None, cameras=CAMERAS, photos=read)
     assert (first.kind, first.instance, first.region) == ("place", -1, -1)
-    assert [each.kind for each in others] == ["match"]
+    assert [each.kind for each in others] == ["leaf"]
     assert len(first.outlines) >= 4
     for view, outline in first.outlines:
         drawn = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
@@ -193,22 +189,11 @@ def test_half_masks_of_a_leaf_are_one_question() -> None:
     views = tuple(view for view, labels in enumerate(TRUE) if (labels == 2).sum() > 0.5 * (TRUE[0] == 2).sum())
     found = list_mask_questions(halved(views), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
     half = [each for each in found if each.kind == "half"]
-    assert [(each.instance, each.num_found >= 3) for each in half] == [(2, True)]
+    assert [(each.instance, len(each.outlines) >= 3) for each in half] == [(2, True)]
     assert found[0] is half[0]
     assert {view for view, _ in half[0].outlines} <= {*views}
     few = list_mask_questions(halved(views[:2]), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
     assert {each.kind for each in few} <= {"place"}
-
-
-def test_what_changes_more_masks_is_asked_first() -> None:
-    """A leaf of two masks that is likely wrong, before a mask that is more so."""
-    maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
-    masks = masks_of(maps)
-    row = row_of(masks, view=4, leaf=2)
-    masks.match_scores[row] = 0.3
-    found = list_mask_questions(masks, None, cameras=CAMERAS)
-    assert [each.kind for each in found] == ["few", "match"]
-    assert found[0].doubt < found[1].doubt
 
 
 def test_the_widest_place_of_leaves_that_hang_together_is_asked_about() -> None:

@@ -63,7 +63,8 @@ def test_without_edits_it_is_todays_result(plant: Path) -> None:
     plain, empty = (run_scene(plant, plant / "masks", IDS_ONLY, corrections=c) for c in (None, Corrections()))
     agreeing = corrections({"op": "same", "at": [place(plant, 0, 1), place(plant, 2, 1)]})
     agreed = run_scene(plant, plant / "masks", IDS_ONLY, corrections=agreeing)
-    for other in (empty, agreed):
+    stem = corrections({"op": "reject", "stem": True} | at(plant, 1, 3))
+    for other in (empty, agreed, run_scene(plant, plant / "masks", IDS_ONLY, corrections=stem)):
         assert torch.equal(plain.masks.instance_ids, other.masks.instance_ids)
         is_same = ~other.masks.is_linked
         assert torch.equal(plain.masks.match_scores[is_same], other.masks.match_scores[is_same])

@@ -32,7 +32,11 @@ def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -
         node = next(each for each in stem.nodes if each.leaf == part.leaf)
         assert part.color == PETIOLE_COLOR
         assert part.points.tolist() == [list(node.place), list(node.base)]
-    for part in (trunk, *petioles):
+    height = np.array([node.place for node in stem.nodes])[:, 2]
+    short = replace(stem, axis=replace(stem.axis, points=stem.axis.points[10:20], radius=stem.axis.radius[10:20]))
+    whole = next(stem_parts(short))  # no leaf floats beyond its ends
+    assert [whole.points[0, 2], whole.points[-1, 2]] == [height.min(), height.max()]
+    for part in (whole, trunk, *petioles):
         assert part.mesh().is_watertight
         assert part.mesh().volume > 0
 

@@ -168,5 +168,6 @@ def test_results_in_memory() -> None:
     assert (on_stem.node, elsewhere.node) == ((1, 2), None)
     assert on_stem.numbers["internode"] == Number(9.0, 1.0, "mm")
     assert on_stem.numbers["divergence"] == Number(137.5, 4.0, "degree")
+    assert "node_azimuth" not in on_stem.numbers
     with pytest.raises(InputError, match="p: has ids but no surfaces"):
         date_of(SimpleNamespace(scene=result.scene, traits=None), 3)  # type: ignore[arg-type]

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from known_leaves import turn_about
 from mvseg.corrections.track_links import leaf_at
 from mvseg.results.read import load_result
+from mvseg.tracking.dates import Number
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
 from mvseg.tracking.pictures import LeafPicture, cut_picture, draw_pictures
@@ -75,6 +77,12 @@ def test_plants_are_shown_in_one_frame_where_they_are_aligned() -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 def test_the_page_in_a_browser(tmp_path: Path) -> None:
     tracks = many_dates(6, 4)
+    numbers = {"node_height": Number(30.0, 2.0, "mm"), "node_azimuth": Number(350.0, 5.0, "degree")}
+    leaves = [replace(leaf, node=(1, 1), numbers=leaf.numbers | numbers) for leaf in tracks.dates[0].leaves]
+    poses = tracks.poses.copy()
+    poses[0, :3, :3] = turn_about(np.array([0, 0, 1.0]), 30)
+    first = replace(tracks.dates[0], leaves=(*leaves[:3], tracks.dates[0].leaves[3]))
+    tracks = replace(tracks, dates=(first, *tracks.dates[1:]), poses=poses)
     write_page(tmp_path, tracks, measure_growth(tracks))
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
@@ -84,6 +92,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         assert shown.locator("#warnings li").inner_text() == "a <warning>"
         assert shown.locator("#dates canvas").count() == 6
         assert shown.locator("#chart polyline").count() == 4
+        assert [one.locator("circle").count() for one in shown.locator("#dates .stems").all()] == [3, 0, 0, 0, 0, 0]
         before = shown.evaluate("document.querySelector('canvas').toDataURL()")
         for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
             shown.keyboard.press(key)
@@ -94,6 +103,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         shown.keyboard.press("Escape")
         assert shown.locator("#leaf").inner_text() == "All leaves"
         data = json.loads(shown.locator("#data").text_content() or "")
+        assert data["leaves"][0]["node"] == {"azimuth": 20.0, "stem": 1, "node": 1, "height": 30.0, "sd": 2.0}
         leaf = data["leaves"][0]
         shown.locator("tbody tr").nth(leaf["track"] - 1).click()
         assert shown.locator("#leaf").inner_text() == f"Leaf {leaf['track']}"

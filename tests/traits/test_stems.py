@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, flat_leaf, move, turn_about
@@ -25,7 +26,7 @@ from mvseg.results.plant_graph import plant_graph
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.nodes import Stem, group_leaves
-from mvseg.traits.stems import MaskAxis, axes_of_masks, find_stems, up_of_stem
+from mvseg.traits.stems import MaskAxis, StemMark, axes_of_masks, find_stems, judge_stems, up_of_stem
 from mvseg.traits.table import read_nodes, write_nodes
 from mvseg.traits.up import level_frame
 from tube_scene import BENT, T, tube_masks
@@ -191,6 +192,13 @@ def test_of_two_stems_in_one_pot_the_one_that_is_shown_tells_no_up() -> None:
         stems = stems_of(two, None, Drawn(*lines))
         assert len(stems) == len(lines)
         assert not any(stem.tells_up for stem in stems)
+    column, row = CAMERAS[[2]].project(torch.tensor([[180.0, 0, 70]]))[0][0, 0].int().tolist()
+    no, yes = (StemMark(2, column, row, is_stem) for is_stem in (False, True))
+    first, second = stems = sorted(stems_of(two, None, Drawn(0.0, 180.0)), key=lambda stem: stem.axis.points[0, 0])
+    assert judge_stems(stems, (yes, no), CAMERAS) == (first,)
+    assert [stem.probability == 1 for stem in judge_stems(stems, (no, yes), CAMERAS)] == [False, True]
+    assert judge_stems(stems, (), CAMERAS) == (first, second)
+    assert judge_stems((), (no,), CAMERAS) == ()
 
 
 def test_masks_of_stems_tell_better_than_leaves() -> None:

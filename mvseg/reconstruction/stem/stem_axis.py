@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -57,6 +58,18 @@ class StemAxis:
         ahead = ends - self.points[[min(3, len(self.points) - 1), max(-4, -len(self.points))]]
         ahead *= self.extension / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-300)
         return np.concatenate([ends[:1] + ahead[:1], self.points, ends[1:] + ahead[1:]])
+
+    def reach(self, places: Sequence[Sequence[float]]) -> StemAxis:
+        """The axis, straight on to the farthest of these places, on `extend`, that lie beyond either end."""
+        axis = self
+        for _ in range(2):  # each end in turn
+            end = axis.points[-1]
+            beyond = (np.array(places).reshape(-1, 3) - end) @ (end - axis.points[-2])
+            if len(places) and beyond.max() > 0:
+                points = np.append(axis.points, [places[int(beyond.argmax())]], axis=0)
+                axis = StemAxis(points, np.append(axis.radius, axis.radius[-1]))
+            axis = axis.reverse()
+        return axis
 
 
 def sweep_circle(points: Floats, radius: Floats) -> trimesh.Trimesh:

@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from mvseg.checks.cameras import find_coverage
 from mvseg.corrections.corrected import APPLIED, PASSED, Fate
 from mvseg.corrections.file import dump_edits, name_edits
-from mvseg.corrections.mask_questions import MaskQuestion, list_mask_questions
+from mvseg.corrections.mask_questions import list_mask_questions
 from mvseg.corrections.same_scene import mark_photos
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.photos import Photos
-from mvseg.results.report.pictures import UNITS, Picture
+from mvseg.results.report.pictures import Picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 
@@ -89,16 +89,9 @@ def describe_questions(result: Result, pictures: Sequence[Picture]) -> list[dict
     cameras = result.scene.cameras.to("cpu")
     photos = result.photos if result.photos is not None and result.photos.exist else None
     asked = list_mask_questions(result.masks, result.surfaces, cameras=cameras, rejected=result.rejected, photos=photos)
-    return [_describe_question(each, pictures, cameras.sizes.tolist()) for each in asked]
-
-
-def _describe_question(question: MaskQuestion, pictures: Sequence[Picture], sizes: list[list[int]]) -> dict[str, Any]:
-    outlines = []
-    for view, outline in question.outlines:
-        size = sizes[view]
-        left, top, right = (share * side for share, side in zip(pictures[view].box[:3], [*size, size[0]], strict=True))
-        points = np.round((outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
-        outlines.append({"view": view, "outline": points})
-    said = asdict(question) | {"doubt": round(question.doubt, 3), "leaf": question.instance, "outlines": outlines}
-    del said["instance"], said["size"]
-    return said
+    sizes = cameras.sizes.tolist()
+    return [
+        asdict(each) | {"outlines": [{"view": view, "outline": pictures[view].place(outline, sizes[view])}
+                                     for view, outline in each.outlines]}
+        for each in asked
+    ]  # fmt: skip

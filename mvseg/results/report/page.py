@@ -15,8 +15,9 @@ from string import Template
 from typing import Any
 
 from mvseg.checks.camera_plan import draw_walk
+from mvseg.results.plant_graph import plant_graph
 from mvseg.results.report.correct import describe_correct, describe_questions
-from mvseg.results.report.leaves import describe_leaves, describe_stems, describe_traits, draw_lines
+from mvseg.results.report.leaves import describe_leaves, describe_traits, draw_lines
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
 from mvseg.results.result import Result
@@ -64,7 +65,7 @@ def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[s
             for index, (view, picture) in enumerate(zip(scene.views, pictures, strict=True))
         ],
         "leaves": describe_leaves(result),
-        "stems": describe_stems(result),
+        "stems": [] if result.traits is None else plant_graph(result.traits)["stems"],
         **describe_traits(result.traits),
         "space": describe_space(result),
         "correct": describe_correct(result, pictures, run=run),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -57,6 +58,11 @@ class Picture:
         """The same picture with the outlines of other masks; `size`: width and height of the photo, pixels."""
         x1, y1, x2, y2 = (round(share * side) for share, side in zip(self.box, size * 2, strict=True))
         return replace(self, outlines=outline_masks(masks, view=view, box=(x1, y1, x2, y2)))
+
+    def place(self, xy: NDArray[Any], size: Sequence[int]) -> list[list[int]]:
+        """Pixel positions (N, 2) of the photo, of that width and height, in whole units of the picture."""
+        x1, y1, x2, _ = np.array(self.box) * (*size, *size)
+        return np.round(_place(xy, (x1, y1, x2, 0))).astype(int).tolist()
 
 
 def draw_picture(photo: np.ndarray, masks: Masks, *, view: int, is_whole: bool = False) -> Picture:

@@ -115,6 +115,7 @@ function buildDates() {
     figure.style.width = `${WIDE + 2}px`;
     canvas.addEventListener("click", (event) => pickAt(canvas, event));
     make("figcaption", undefined, figure);
+    make("div", undefined, figure, "stems");
   });
 }
 
@@ -127,6 +128,20 @@ function captionDates() {
     const events = [`${date.leaves} leaves`, of && `${withUnit(Number(of[1].toPrecision(3)), area.unit)}`,
       index && date.born && `${date.born} new`, date.gone && `${date.gone} gone`];
     make("span", events.filter(Boolean).join(" · "), caption, "events");
+  });
+}
+
+// The nodes of each stem on each date, all dates up to one height; leaves as they are tracked.
+function drawStems() {
+  const all = data.leaves.filter(({ node }) => node).map(({ date, track, node }) => ({ ...node, date, leaf: track }));
+  const highest = Math.max(...all.map(({ height }) => height), 1e-12);
+  const colors = new Map(Object.entries(data.colors).map(([track, color]) => [Number(track), color]));
+  document.querySelectorAll("#dates .stems").forEach((place, date) => {
+    const here = all.filter((node) => node.date === date);
+    place.replaceChildren(...[...new Set(here.map(({ stem }) => stem))].sort((one, other) => one - other).map((number) => {
+      const title = `Stem ${number} on ${dayOf(data.dates[date])}: height against azimuth`;
+      return drawNodes(here.filter(({ stem }) => stem === number), { title, unit: data.unit, colors, choose: pick, highest });
+    }));
   });
 }
 
@@ -275,6 +290,7 @@ function show() {
   find("warnings").replaceChildren();
   for (const sentence of data.warnings) make("li", sentence, find("warnings"));
   captionDates();
+  drawStems();
   buildTable();
   pick(tracks.includes(picked) ? picked : 0);
 }

@@ -1,4 +1,4 @@
-// A mask that is painted: strokes add to it, the eraser takes away. Its outline is that of its largest part.
+// A painted mask: strokes add, the eraser takes away; its largest part counts.
 
 const GRAIN = 2; // units of the picture to a painted pixel
 const OFF = 1.2; // units that the outline may be off
@@ -56,8 +56,7 @@ class Paint {
   }
 }
 
-// The corners of the pixels around a part that hangs together by their edges, from its first pixel in reading order on,
-// with the part on the right hand.
+// The corners of pixels around a connected part, from its first pixel in reading order, the part on the right.
 function walkAround(isIn, [x0, y0]) {
   const corners = [];
   let [x, y, dx, dy] = [x0, y0, 1, 0];

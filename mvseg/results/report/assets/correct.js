@@ -1,4 +1,4 @@
-// The mode "Correct": two photos side by side, what the user picks and draws in them, and what they say of it.
+// The mode "Correct": two photos side by side, what the user picks and draws there, and their edits.
 
 const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
   u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area", t: "learn" };
@@ -111,7 +111,7 @@ class Work {
     this.changed();
   }
 
-  // Where no mask is, the best of what was not taken for a leaf, or of what should be there, is asked about.
+  // Where no mask is: ask the first question about this place.
   offer(view, at) {
     const here = this.open.filter((doubt) => doubt.outlines.some((one) => one.view === view && isInside(at, one.outline)));
     if (here.length) this.ask(here[0]);
@@ -142,7 +142,7 @@ class Work {
     this.say(this.open.length ? "These were the questions; those that are left can be asked." : "Nothing doubtful is left.");
   }
 
-  // The questions that are open and were not asked yet, the one that is asked now included.
+  // Open questions that were not asked yet, and the one that is asked now.
   get left() {
     return this.open.filter((doubt) => !this.skipped.has(doubt.name));
   }
@@ -165,7 +165,7 @@ class Work {
     }
     this.active = first;
     this.picks = [[doubt.view, doubt.mask], [doubt.otherView, doubt.otherMask]]
-      .filter(([, mask]) => mask && (doubt.kind !== "few" || mask === doubt.mask))
+      .filter(([, mask]) => mask)
       .map(([view, mask]) => this.pickOf(view, `r${mask.region}`, mask));
     this.note = "";
     this.changed();
@@ -180,7 +180,7 @@ class Work {
     if (op === "undo") return this.undo();
     if (op === "learn") return this.server?.learn();
     if (TOOLS.includes(op)) return this.take(op);
-    const found = this.editsOf(op, all !== undefined || ["few", "leaf"].includes(wasAsked?.kind));
+    const found = this.editsOf(op, all !== undefined);
     if (!found.length) return;
     this.note = "";
     this.add(found);
@@ -189,10 +189,11 @@ class Work {
 
   editsOf(op, everywhere) {
     if (op === "same" || op === "different") return this.linkEdits(op);
-    if (this.doubt?.kind === "leaf") return this.offeredEdits(op, this.doubt.outlines);
-    if (this.doubt?.kind === "missing" && op === "reject") return [this.noLeafIn(this.doubt.outlines[0])];
-    if (op === "confirm" && this.doubt?.outlines.length) {
-      return this.outlineEdits(this.doubt.view, this.doubt.outlines[0].outline);
+    if (this.doubt?.kind === "stem") return [{ ...this.noLeafIn(this.doubt.outlines[0]), op, stem: true }];
+    if (this.doubt?.isOffered) return this.offeredEdits(op, this.doubt.outlines);
+    if (this.doubt?.kind === "place") {
+      const [first] = this.doubt.outlines;
+      return op === "reject" ? [this.noLeafIn(first)] : this.outlineEdits(first.view, first.outline);
     }
     return this.markEdits(op, everywhere);
   }
@@ -227,7 +228,7 @@ class Work {
     return [{ op: "outline", view: name, polygon, ...(leaf ? { leaf } : {}) }, ...(others.length ? [link] : [])];
   }
 
-  // A candidate becomes a leaf, by an outline of each of its masks under one new name; or none.
+  // Make a candidate a leaf, by outlines of its masks under one new name; or reject it.
   offeredEdits(op, outlines) {
     if (op === "reject") return [{ ...this.noLeafIn(outlines[0]), everywhere: true }];
     const name = this.freeName("offered");
@@ -241,22 +242,21 @@ class Work {
     return `${word} ${number}`;
   }
 
-  // The name that is in the field: that of the leaf whose outline in another photo comes first, or else a new one.
+  // The name in the field: that of an outline just drawn in another photo, else a new one.
   nameOf(view) {
     const { name } = this.data.views[view];
-    if (this.doubt && this.doubt.kind !== "place") return ""; // an answer shows what was asked about
+    if (this.doubt && !this.doubt.isOfMany) return ""; // an answer shows what was asked about
     return this.partner && this.partner.view !== name ? this.partner.leaf : this.freeName("new");
   }
 
-  // An outline that the user draws: the answer to a question shows what that asks about, in its photo.
+  // An outline that the user draws, perhaps as an answer: then it shows the leaf in question.
   drawnEdits(view, points, leaf) {
     const { doubt } = this;
-    if (doubt?.kind === "leaf" && !leaf) {
+    if (doubt?.isOffered && !leaf) {
       const others = doubt.outlines.filter((one) => one.view !== view);
       return this.offeredEdits("confirm", [{ view, outline: points }, ...others]);
     }
-    const isAnswer = doubt && !["place", "leaf"].includes(doubt.kind) && !leaf;
-    if (isAnswer && doubt.otherMask && !this.picks.some((pick) => pick.view !== view)) {
+    if (doubt?.otherMask && !leaf && !this.picks.some((pick) => pick.view !== view)) {
       this.picks = [this.pickOf(doubt.otherView, `r${doubt.otherMask.region}`, doubt.otherMask)];
     }
     return this.outlineEdits(view, points, leaf);
@@ -286,7 +286,7 @@ class Work {
     this.changed();
   }
 
-  // A stroke of the brush or the eraser, on a mask that is painted anew, or on the one that is picked in this photo.
+  // A stroke of the brush or the eraser, on a new mask or on the one that is picked in this photo.
   paint(pane, from, to) {
     const erases = this.tool === "erase";
     if (this.draft?.pane !== pane || !this.draft.paint) {
@@ -300,7 +300,7 @@ class Work {
     this.changed();
   }
 
-  // The line is whole: a cut is made at once, an outline waits for its leaf's word.
+  // The line is whole: cut at once; an outline waits for the name of its leaf.
   finish() {
     const { draft } = this;
     if (!draft || draft.isClosed) return;
@@ -342,7 +342,7 @@ class Work {
     this.add(edits);
     const [first, second] = this.panes;
     if (wasAsked?.kind === "half" && pane === first && second.view !== first.view) this.drawBeside(wasAsked);
-    else if (wasAsked && wasAsked.kind !== "place") this.goOn(wasAsked); // there may be more leaves
+    else if (wasAsked && !wasAsked.isOfMany) this.goOn(wasAsked); // there may be more leaves
     else if (edits.length === 1) this.offerPartner(pane, leaf);
   }
 
@@ -354,7 +354,7 @@ class Work {
     this.say("Now all of it in the photo on the right: the others follow.");
   }
 
-  // A photo beside another one that is likely to show the same leaf, from another side.
+  // A photo that likely shows the same leaf from another side.
   partnerOf(view) {
     const angles = this.data.correct.angles[view];
     return angles.map((_, other) => other).filter((other) => other !== view)
@@ -421,11 +421,11 @@ function isOnMask(mask, [x, y]) {
   return brush.isPointInPath(mask.shape, x, y, "evenodd");
 }
 
-// The masks that edits say are no leaves: they are struck out before what follows is known.
+// Masks that edits reject: they are struck out at once.
 function rejectedMasks(places, views) {
   const gone = new Set();
   for (const { edit, view, at } of places) {
-    const mask = view < 0 ? null : views[view].masks.findLast((one) => isOnMask(one, at));
+    const mask = view < 0 || edit.stem ? null : views[view].masks.findLast((one) => isOnMask(one, at));
     if (!mask) continue;
     const isAll = edit.everywhere && mask.leaf > 0;
     const all = isAll ? views.flatMap((one) => one.masks.filter(({ leaf }) => leaf === mask.leaf)) : [mask];

@@ -1,4 +1,4 @@
-// The list of edits: what corrections.json holds. It is kept in the browser, so that a reload loses nothing.
+// The list of edits, as in corrections.json. The browser keeps it over a reload.
 
 const FORMAT = "mvseg-corrections/1";
 const MOST_EDITS = 10000;
@@ -72,7 +72,7 @@ class Edits {
   }
 }
 
-// The edits in the text of a corrections.json. Throws an Error whose message is one sentence.
+// The edits in a corrections.json. Throws an Error of one sentence.
 // `photos`: of this plant; a file that names others was made for another one.
 function readEdits(text, photos) {
   if (text.length > MOST_BYTES) throw new Error(`the file has ${text.length} bytes, expected at most ${MOST_BYTES}`);
@@ -128,7 +128,7 @@ function viewNamed(name, views) {
   return -1;
 }
 
-// {view, at, symbol} of all that edits point at, in units of the pictures; view -1 for photos that are not here.
+// {view, at, symbol} of all places of edits, in units of the pictures; view -1 for photos that are not here.
 function placesOf(list, { data, frames }) {
   const symbols = {
     outline: "\u270e", reject: "\u2715", confirm: "\u2713", same: "=", different: "\u2260", split: "\u2702",
@@ -144,6 +144,7 @@ function placesOf(list, { data, frames }) {
 
 function describeEdit(edit) {
   const names = (list) => [...new Set(list)].join(", ");
+  if (edit.stem) return `${edit.op === "confirm" ? "the stem" : "no stem"}, in ${edit.view}`;
   const all = edit.everywhere ? ", the leaf in all photos" : "";
   switch (edit.op) {
     case "outline": return `outline drawn in ${edit.view}${edit.leaf ? `, leaf \u201c${edit.leaf}\u201d` : ""}`;

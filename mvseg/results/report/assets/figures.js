@@ -1,4 +1,4 @@
-// Figures to export: a picture of the page as SVG, or as PNG with three times as many pixels; dark on white.
+// Export a picture of the page as SVG, or as PNG with three times as many pixels; dark on white.
 
 const LARGER = 3;
 const PAPER = { ink: "#1d241d", back: "#ffffff" };

@@ -1,4 +1,4 @@
-// Between the units of a picture, in which masks are outlined, and pixels of the user's photo, with its distortion.
+// Between units of a picture and pixels of the user's photo, with its distortion.
 
 class Frame {
   constructor({ box, proportion }, { size, lens }, lenses) {
@@ -10,7 +10,7 @@ class Frame {
     this.lens = lens === null ? null : lenses[lens];
   }
 
-  // The whole photo, in units: what lies around the picture has negative numbers, or ones above its size.
+  // The whole photo, in units: around the picture they are negative or above its size.
   get whole() {
     const [x, y] = [-this.left / this.scale, -this.top / this.scale];
     return { x, y, width: this.size[0] / this.scale, height: this.size[1] / this.scale };
@@ -45,7 +45,7 @@ class Frame {
   }
 }
 
-// A point well inside a polygon: of a grid of points, the one that is farthest from its edges.
+// A point well inside a polygon: of a grid, the one farthest from its edges.
 function insidePoint(polygon) {
   const [xs, ys] = [0, 1].map((axis) => polygon.map((point) => point[axis]));
   const [x1, x2, y1, y2] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];

@@ -1,4 +1,4 @@
-// One photo to work on: zoom, move, pick masks, draw. A mouse, a pen and fingers do the same things.
+// One photo to work on: zoom, move, pick masks, draw; by mouse, pen or fingers.
 
 const CLICK = 6; // pixels of the screen that a click may move
 const NEAR = 14; // pixels to the first corner, to close an outline
@@ -232,7 +232,7 @@ class Pane {
     }
   }
 
-  // Two fingers move and zoom, also while one draws: what the first finger has drawn so far is dropped.
+  // Two fingers move and zoom; what the first one has drawn so far is dropped.
   pinch(pointer, before) {
     const { draft } = this.work;
     if (draft?.pane === this && !draft.isClosed) this.work.draft = null;

@@ -1,4 +1,4 @@
-// The photos, cropped to the plant, with the masks as outlines in the colours of their leaves.
+// The photos, cropped to the plant, with outlines of masks in the colours of leaves.
 
 const UNITS = 2000; // width of a picture, of which its outlines are drawn
 

@@ -1,6 +1,6 @@
 "use strict";
 
-// Which leaf is selected, and which one the pointer is on. Every part of the page listens; none knows of another.
+// The leaf that is selected, and the one under the pointer. All parts of the page listen.
 const selection = {
   selected: null,
   hovered: null,
@@ -80,7 +80,7 @@ function fill(node, attributes, children) {
   return node;
 }
 
-// The address of a JPEG in base64; the page holds each picture once, whatever shows it.
+// The address of a JPEG in base64: the page holds each picture once.
 function addressOf(base64) {
   return URL.createObjectURL(new Blob([bytesOf(base64)], { type: "image/jpeg" }));
 }

@@ -1,4 +1,4 @@
-// Where `mvseg correct` serves the page: every edit is saved at once, and what changes because of it is shown.
+// Where `mvseg correct` serves the page: save every edit, and show what changes.
 
 const AGAIN = 2000; // milliseconds until what failed is tried again
 

@@ -40,7 +40,7 @@ function middleOf(positions) {
   return points.reduce((best, point) => (point.distanceTo(mean) < best.distanceTo(mean) ? point : best));
 }
 
-// A camera is a pyramid with its photo as the base; the more cameras there are, the smaller.
+// A camera is a pyramid with its photo as base; the more cameras, the smaller.
 function makeCamera(entry, { masks }, { view, share, texture }) {
   const [center, up, ahead] = [entry.center, entry.up, entry.ahead].map((numbers) => new THREE.Vector3(...numbers));
   const rays = entry.corners.map((corner) => new THREE.Vector3(...corner));
@@ -74,7 +74,7 @@ function loadTexture(address, draw) {
   return texture;
 }
 
-// Paint the masks of a view over its photo: `box` is the part of the photo that they are drawn on. null: the photo alone.
+// Paint the masks of a view over the part `box` of its photo; null: the photo alone.
 function paintTexture(texture, masks) {
   if (!texture?.image) return; // not loaded yet
   const photo = (texture.userData.photo ??= texture.image);
@@ -181,7 +181,7 @@ function hangBackdrop(backdrop, center, rays) {
   return corners;
 }
 
-// Let the picture with these corners, which is parallel to the screen, fill the view, without turning the camera.
+// Let a picture that is parallel to the screen fill the view, without turning the camera.
 function aimAt(camera, corners) {
   const [low, high] = [corners[3], corners[1]].map((corner) => camera.worldToLocal(corner.clone()));
   const scale = camera.near / -low.z;

@@ -1,5 +1,4 @@
-// The table of leaves. A click on a header sorts; missing numbers are last either way. Columns are chosen, and what is
-// shown can be saved as CSV.
+// The table of leaves. A click on a header sorts, missing numbers last; columns are chosen, and saved as CSV.
 
 const FIRST = ["area", "length", "width", "insertion_height"]; // beside leaf, use and doubts: what most people need
 
@@ -72,7 +71,7 @@ function compare(a, b, sign) {
   return sign * (typeof a === "string" ? a.localeCompare(b) : a - b);
 }
 
-// A checkbox that shows a column of these rows; it hides the column right away if nobody asked for it.
+// A checkbox that shows a column; it hides at once one that nobody asked for.
 function makeChoice(column, rows, index) {
   const box = element("input", { type: "checkbox" });
   const show = () => rows.forEach((row) => { row.cells[index].hidden = !box.checked; });
@@ -98,8 +97,7 @@ function writeCell(value) {
   return /[",]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
 }
 
-// Each column: name, unit, meaning, whether it is shown at first, for a leaf its text and what it is sorted by, and its
-// fields in CSV.
+// Columns: name, unit, meaning, whether shown at first, text and sort key of a leaf, and fields in CSV.
 function listColumns(data) {
   const masks = data.views.flatMap((view) => view.masks);
   const mean = (leaf) => {
