@@ -82,16 +82,14 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
             raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
         super().__init__(detector.backbone, detector.rpn, detector.roi_heads, detector.transform)
-        self.verify, self.proposer = (
-            verify,
-            Proposer(
-                self,
-                num_iterations=num_iterations,
-                proposal_iou=proposal_iou,
-                cluster_iou=cluster_iou,
-                proposals_per_view=proposals_per_view,
-                match=match,
-            ),
+        self.verify = verify
+        self.proposer = Proposer(
+            self,
+            num_iterations=num_iterations,
+            proposal_iou=proposal_iou,
+            cluster_iou=cluster_iou,
+            proposals_per_view=proposals_per_view,
+            match=match,
         )
         self.train(detector.training)
 
