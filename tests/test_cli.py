@@ -25,6 +25,7 @@ import mvseg
 from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
+from mvseg.detection.cached_detections import SCENE_FILE
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning, warn
 from mvseg.findings.finding import Finding
@@ -259,6 +260,7 @@ def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(tmp_path
     kept, said = tmp_path / "out.detections", "mvseg: going on from the detections in"
     kept.mkdir()
     (kept / f"{'0' * 64}.safetensors").touch()
+    (kept / SCENE_FILE).write_bytes(os.fsencode(os.path.realpath(plant)))
     for holds_some in (True, False):
         assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *unverified]) == 0
         assert (f"{said} {kept}, for equal photos and options" in capsys.readouterr().err) == holds_some

@@ -2,13 +2,14 @@
 
 One .safetensors file per photo, in a folder that `mvseg infer` deletes when the result is there, and that `mvseg batch`
 keeps for the next batch. Its name is a hash of everything that the detections depend on: the photo, its camera, the
-weights and the options.
+weights and the options. A hidden file says whose photos they are of.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -19,10 +20,12 @@ from typing import Any
 import safetensors.torch
 from torch import Tensor
 
+from mvseg.errors import InputError
 from mvseg.formats.photos import Photos, photo_bits
 from mvseg.system.atomic import is_partial, lock_folder, write_whole
 
 CACHED_NAME = re.compile(r"(learned-)?[0-9a-f]{64}\.safetensors")
+SCENE_FILE = ".scene"
 FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 
@@ -85,21 +88,36 @@ def delete_cached(folder: Path, *, but: Collection[str] = ()) -> None:
         return
     for path in [*folder.iterdir()]:
         is_cached = CACHED_NAME.fullmatch(path.name) or (is_partial(path) and CACHED_NAME.match(path.name[1:]))
-        if path.name not in but and is_cached:
+        if path.name not in but and (is_cached or (path.name == SCENE_FILE and not but)):
             path.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
 
 
 @contextmanager
-def claim_cache(folder: Path) -> Iterator[bool]:
-    """Have the folder of cached detections for one run, which may delete it; gives whether it holds some. It is made if
-    it is missing, and deleted in the end if nothing was cached. Raises InputError: another run works with it."""
+def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterator[bool]:
+    """Have the folder of cached detections of a scene for one run, which may delete it; gives whether it holds some.
+
+    Args:
+        folder: made if it is missing; deleted in the end if nothing was cached.
+        overwrite: take it also when it holds what was found in another scene's photos.
+
+    Raises:
+        InputError: another run works with it, or it is another scene's.
+    """
     made = [parent for parent in folder.parents if not parent.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     try:
         with lock_folder(folder):
             try:
+                owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
+                earlier = owner.read_bytes() if owner.is_file() else b"" if _holds_some(folder) else place
+                if earlier != place and not overwrite:
+                    other, why = os.fsdecode(earlier), "holds detections, but not of which photos"
+                    if other:
+                        why = f"keeps what a run that was cut off found in the photos of {other}, not of {scene}"
+                    raise InputError(f"{folder}: {why}; expected another --out, or --overwrite true")
+                write_whole(owner, lambda partial: partial.write_bytes(place))
                 yield _holds_some(folder)
             finally:
                 if not _holds_some(folder):

@@ -51,7 +51,7 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
     cache, finds = place.with_name(f"{place.name}.detections"), request.masks is None
     with ExitStack() as stack:
         stack.enter_context(running(plan=_plan_stages(request.config, finds=finds)))
-        if finds and stack.enter_context(claim_cache(cache)):
+        if finds and stack.enter_context(claim_cache(cache, request.scene, overwrite=request.overwrite)):
             say(f"mvseg: going on from the detections in {cache}, for equal photos and options", to_stderr=True)
         with running(num_workers=num_workers):
             result, card = solve_scene(request, cache=cache)

@@ -93,26 +93,39 @@ def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
 class TestClaim:
     NAME = f"{'0' * 64}.safetensors"
 
-    def test_a_run_goes_on_from_what_another_one_cached(self, tmp_path: Path) -> None:
-        for is_cached in (False, True):
-            with claim_cache(tmp_path / "kept") as holds_some:
-                assert holds_some == is_cached
-                write_detections(tmp_path / "kept" / self.NAME, FOUND)
-        with claim_cache(tmp_path / "kept"):
-            delete_cached(tmp_path / "kept")
+    def test_only_of_the_same_scene(self, tmp_path: Path) -> None:
+        kept, scene = tmp_path / "kept", tmp_path / "a"
+        with claim_cache(kept, scene) as holds_some:
+            assert not holds_some
+            write_detections(kept / self.NAME, FOUND)
+        with claim_cache(kept, scene) as holds_some:
+            assert holds_some
+        message = rf"kept: keeps what .* found in the photos of {scene}, not of .*b; expected another --out, or"
+        with pytest.raises(InputError, match=message):
+            claim_cache(kept, tmp_path / "b").__enter__()
+        assert (kept / self.NAME).is_file()
+        with claim_cache(kept, tmp_path / "b", overwrite=True):
+            delete_cached(kept)
         assert list(tmp_path.iterdir()) == []
 
+    def test_detections_that_say_nothing_of_their_photos_are_not_taken(self, tmp_path: Path) -> None:
+        write_detections(tmp_path / "kept" / self.NAME, FOUND)
+        with pytest.raises(InputError, match="kept: holds detections, but not of which photos"):
+            claim_cache(tmp_path / "kept", tmp_path).__enter__()
+        with claim_cache(tmp_path / "kept", tmp_path, overwrite=True) as holds_some:
+            assert holds_some
+
     def test_by_one_run_at_a_time(self, tmp_path: Path) -> None:
-        with claim_cache(tmp_path / "kept"), pytest.raises(InputError, match="another run is writing"):
-            claim_cache(tmp_path / "kept").__enter__()
+        with claim_cache(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
+            claim_cache(tmp_path / "kept", tmp_path).__enter__()
 
     def test_a_run_that_fails_before_leaves_nothing(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError), claim_cache(tmp_path / "new" / "er" / "kept"):
+        with pytest.raises(InputError), claim_cache(tmp_path / "new" / "er" / "kept", tmp_path):
             raise InputError
         assert list(tmp_path.iterdir()) == []
         (tmp_path / "kept").mkdir()
         (tmp_path / "kept" / "notes.txt").touch()
-        with claim_cache(tmp_path / "kept"):
+        with claim_cache(tmp_path / "kept", tmp_path):
             pass
         assert [path.name for path in (tmp_path / "kept").iterdir()] == ["notes.txt"]
 

@@ -461,7 +461,7 @@ def test_one_key_makes_a_leaf_of_what_was_not_chosen(
 def test_a_guessed_stem_is_asked_about_once(opened: Person, tmp_path: Path) -> None:
     opened.page.evaluate("""() => {
       const line = { name: "stem_1", path: "M900 200L950 900", isGuessed: true };
-      for (const view of data.views.slice(0, 2)) view.stems = [line, { ...line, leaf: 1 }];
+      for (const view of modes.work.data.views.slice(0, 2)) view.stems = [line, { ...line, leaf: 1 }];
       modes.work.read();
     }""")
     asks = "modes.work.open.filter(({ kind }) => kind === 'stem').length"
