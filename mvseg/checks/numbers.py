@@ -67,7 +67,7 @@ class PhotoNumbers:
     blank_share: float = 0.03  # chosen: the same of a dark photo, relative to its level; real photos have 0.2
     rounding: float = 1.0  # definition: the same that rounding makes
     dark: int = 30  # chosen: grey level below which 99 % of the pixels of a dark photo are
-    stops: float = 1 / 3  # chosen: exposures between two photos that are noted: the least step of a camera's dials
+    stops: float = 1 / 3  # definition: the least step of a camera's dials; larger differences are noted
     burnt: float = 0.7  # chosen: share of white pixels above which a photo is overexposed
     gamma: float = 2.2  # definition: exponent of light in photos: blur mixes light, edges are where it is halfway
     smooth_px: float = 4.0  # chosen: pixels over which light hardly changes, unlike ink and paper at an edge

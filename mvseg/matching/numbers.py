@@ -141,7 +141,7 @@ class NViewNumbers:
     explained: float = 0.5  # chosen: mean score of clusters by weights from which no dilation is tried: -0.022, 0
     # Poses are far off, or leaves move between photos, where it is less: 0.02 to 0.21 for three plants that sway, seen
     # from near, 0.34 for the true masks of one; 0.39 or more for 12 other plants, and 0.42 for all evaluation scenes.
-    unexplained: float = 0.3  # insensitive: the same, below which these clusters are the answer
+    unexplained: float = 0.3  # chosen: mean score of clusters by weights below which these are the answer
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ def judge_stems(stems: Sequence[Stem], marks: Sequence[StemMark], cameras: Camer
 
 
 def _gap_in_view(axis: StemAxis, mark: StemMark, cameras: Cameras) -> float:
-    """Distance between a marked pixel and the line of a stem in its view, pixels."""
+    """Distance between a marked pixel and the nearest point of an axis in its view, pixels; inf behind the camera."""
     xy, depth = cameras[[mark.view]].to("cpu").project(torch.from_numpy(axis.points))
     return float((xy[0] - torch.tensor([mark.column, mark.row])).norm(dim=1).where(depth[0] > 0, torch.inf).min())
 
