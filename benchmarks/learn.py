@@ -4,7 +4,7 @@ For each scene a table: as it is; after one, two, three rounds (each from the la
 area says); and after one round in which a person has outlined six leaves in two photos each, the largest ones that are
 not right; these outlines do not count in the figures. The agreed area (`rate_pass`, in percent of all pixels) stands
 beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep:
-it grows by `GROWTH`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
+see `order_ratings`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
 many are stems (`stem_chances`), and E is the expected number of correct masks. Weights and detections are kept in
 --cache.
 """
@@ -38,11 +38,12 @@ from mvseg.masks import Masks
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
-from mvseg.pipeline.learn import GROWTH, learn
+from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.traits.filters import SURELY_STEM
+from mvseg.verification.leaf_scores import order_ratings
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
 TABLE = (
@@ -137,7 +138,7 @@ def main() -> None:
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
             after = replace(plant, colors=before.leaf_colors).rating
-            stays = stays and after.agreed_area > GROWTH * before.rating.agreed_area
+            stays = stays and order_ratings([before.rating, after])[0] == 1
             name = f"round {number}, at {plant.image_size} px"
             show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
         if args.person and truth is not None:

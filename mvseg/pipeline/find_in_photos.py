@@ -114,11 +114,11 @@ def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> list[Pl
 
 
 def order_sizes(results: Sequence[Plant]) -> list[Plant]:
-    """The best pass, see `order_ratings`. Then the second best, if its agreed area is at least `DETECTION.as_good`
-    times as large: the caller decides between the two by all views."""
+    """The best pass, see `order_ratings`. Then the next one, if its agreed area is at least `DETECTION.as_good` times as
+    large: the caller decides between the two by all views."""
     first, *others = [results[index] for index in order_ratings([each.rating for each in results])]
     least = DETECTION.as_good * first.rating.agreed_area
-    return [first, *(each for each in others[:1] if first.rating.agreed_area >= each.rating.agreed_area >= least)]
+    return [first, *(each for each in others[:1] if each.rating.agreed_area >= least)]
 
 
 def run_near(plant: Plant, *, cache: CachedDetections | None) -> Plant:

@@ -39,10 +39,6 @@ from mvseg.verification.numbers import CHOICE
 from mvseg.verification.picture import is_familiar
 
 ROUNDS = 2  # limit: where nobody says how many; most plants gain nothing from a third one (docs/detector.md)
-# chosen: new weights stay if their rating is at least so many times that of the weights before. Of rounds that grew by
-# 1.04 to 1.08, four gained 0.03 to 0.09 of MV-PQ and one lost 0.02; of five that did not grow, four lost
-# (docs/notes/detector.md).
-GROWTH = 1.03
 
 
 def learn(
@@ -53,7 +49,7 @@ def learn(
     A round: labels from the leaves that the views chose, and from the user's edits; the first weights learn these
     (`fine_tune`); the detector looks again, at the same size and at those next to it (`run_near`); the views choose.
     The better one stays, by the agreed area (`rate_pass`), and the next round is at its size. Rounds end when it grows
-    by less than `GROWTH`, or with Ctrl-C. Warns (InputWarning) where the views agree about too few leaves.
+    by less than `CHOICE.growth`, or with Ctrl-C. Warns (InputWarning) where the views agree about too few leaves.
 
     Args:
         cache: where the weights lie; rounds that are there already are not learned again.
@@ -77,8 +73,7 @@ def learn(
             taught = _learn_once(best, labels, cache)
             before, after = best.rating, replace(taught, colors=best.leaf_colors).rating
             areas.append(after.agreed_area)
-            is_better = order_ratings([before, after])[0] == 1 and after.agreed_area >= GROWTH * before.agreed_area
-            if rounds is None and not is_better:
+            if rounds is None and order_ratings([before, after])[0] == 0:
                 break
             best = replace(taught, learned=replace(taught.learned, rounds=number))
     except KeyboardInterrupt:

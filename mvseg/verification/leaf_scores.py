@@ -226,16 +226,23 @@ def rate_pass(
 
 
 def order_ratings(ratings: Sequence[Rating]) -> list[int]:
-    """Indices of ratings, the best one first: by the agreed area; of equals, the first.
+    """Indices of the answers among ratings, the best one first, then by the agreed area.
+
+    The best one is the first whose agreed area no other exceeds by `CHOICE.growth`: equal runs differ by as much, so
+    ratings come in the order in which one would believe them, the usual size and the weights at hand first.
 
     The area alone has a degenerate optimum: the whole plant as one leaf. So passes with too few leaves
-    (`CHOICE.least_leaves`) or too few correct masks (`CHOICE.least_expected`) come last.
+    (`CHOICE.least_leaves`) or too few correct masks (`CHOICE.least_expected`) are no answers, unless all are so.
     """
     most = max((each.expected for each in ratings), default=0.0)
+    every = range(len(ratings))
     is_answer = [
         each.num_leaves >= CHOICE.least_leaves and each.expected >= CHOICE.least_expected * most for each in ratings
     ]
-    return sorted(range(len(ratings)), key=lambda index: (not is_answer[index], -ratings[index].agreed_area))
+    answers = [index for index in every if is_answer[index]] or [*every]
+    largest = max((ratings[index].agreed_area for index in answers), default=0.0)
+    best = next((index for index in answers if CHOICE.growth * ratings[index].agreed_area >= largest), None)
+    return sorted(answers, key=lambda index: (index != best, -ratings[index].agreed_area))
 
 
 def log_odds(values: Floats) -> Floats:
