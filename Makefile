@@ -33,7 +33,7 @@ fuzz: $(VENV)/complete
 # minutes to hours; PREVIOUS=DIR takes turns with another checkout; SCENES=DIR... are measured in place of simulated ones
 bench: $(VENV)/complete
 	$(PYTHON) -m benchmarks.speed $(SCENES) $(if $(PREVIOUS),--previous $(PREVIOUS)) $(if $(SKINS),--skins $(SKINS)) \
-	    --cache results/speed --threads 1 2 8 --into docs/performance.md
+	    --cache results/speed --threads 1 2 8 --into docs/notes/performance.md
 
 lint: $(VENV)/complete
 	$(PYTHON) -m ruff check .

@@ -20,23 +20,27 @@ VERSION = os.environ.get("DOCS_VERSION", "")  # of a release, whose site keeps i
 SOURCE = f"{REPOSITORY}/blob/{'v' + VERSION if VERSION else 'main'}/"
 # Pages in the order of the site; those that are not there are left out, and those that are not listed come last.
 ORDER = {
-    "Start": ("index.md", "guide.md", "check.md", "results.md", "corrections.md", "glossary.md"),
-    "Bring your own": (
-        "own-masks.md",
-        "own-cameras.md",
+    "Start": ("index.md", "guide.md", "glossary.md"),
+    "How to": (  # at most two screens each; tests/test_docs.py counts their words
         "pose.md",
+        "scale.md",
+        "turntable.md",
+        "own-cameras.md",
+        "own-masks.md",
         "recipes.md",
-        "fine-tune.md",
-        "batch.md",
+        "check.md",
+        "corrections.md",
         "tracking.md",
+        "batch.md",
+        "cluster.md",
+        "fine-tune.md",
         "data-out.md",
-        "formats.md",
     ),
     "Notebooks": ("notebooks/demo_plant.md", "notebooks/own_arrays.md"),
-    "Method": ("matching.md", "surfaces.md", "traits.md", "detector.md"),
+    "Reference": ("results.md", "traits.md", "formats.md", "api.md"),
+    "How it works": ("detector.md", "matching.md", "surfaces.md"),
     "How well it works": ("gallery.md", "benchmarks.md", "performance.md", "reliability.md"),
-    "Python": ("api.md",),
-    "Notes": (
+    "Notes: measurements": (
         "notes/matching.md",
         "notes/surfaces.md",
         "notes/traits.md",
@@ -46,6 +50,7 @@ ORDER = {
         "notes/corrections.md",
         "notes/tracking.md",
         "notes/performance.md",
+        "notes/reliability.md",
     ),
 }
 
@@ -99,5 +104,5 @@ def order_pages(pages: list[str]) -> list[dict[str, Any]]:
         title: [page for page in wanted if page in pages] for title, wanted in ORDER.items()
     }
     listed = {page for wanted in sections.values() for page in wanted}
-    sections["Bring your own"] += sorted(set(pages) - listed)
+    sections["How to"] += sorted(set(pages) - listed)
     return [{title: list(wanted)} for title, wanted in sections.items() if wanted]

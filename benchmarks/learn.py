@@ -19,7 +19,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -117,7 +116,6 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
-    np.set_printoptions(precision=3)
     warnings.simplefilter("ignore", InputWarning)
     if args.table:
         print("| " + " | ".join(TABLE) + " |\n|" + "---|" * len(TABLE))

@@ -139,10 +139,16 @@ def test_names_in_backticks_are_in_the_code() -> None:
 
 def test_pages_that_nobody_listed_are_shown(pages: ModuleType) -> None:
     nav = pages.order_pages(["guide.md", "index.md", "harvest.md", "api.md"])
-    assert nav == [{"Start": ["index.md", "guide.md"]}, {"Bring your own": ["harvest.md"]}, {"Python": ["api.md"]}]
+    assert nav == [{"Start": ["index.md", "guide.md"]}, {"How to": ["harvest.md"]}, {"Reference": ["api.md"]}]
     missing = {page for wanted in pages.ORDER.values() for page in wanted} - {"index.md"}
     missing -= {path.relative_to(DOCS).with_suffix(".md").as_posix() for path in DOCS.rglob("*.*")}
     assert missing == set()
+
+
+def test_a_how_to_fits_on_two_screens(pages: ModuleType) -> None:
+    """About: by its words. Details belong to the reference, and measurements to notes."""
+    texts = {page: (DOCS / page).read_text(encoding="utf-8") for page in ("guide.md", *pages.ORDER["How to"])}
+    assert {page: num for page, text in texts.items() if (num := len(text.split())) > 700} == {}
 
 
 def test_the_site_of_a_release_has_its_own_address(pages: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

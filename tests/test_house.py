@@ -422,7 +422,7 @@ def test_files_that_the_documents_name_are_there() -> None:
 
 
 def test_every_promise_names_tests_that_exist() -> None:
-    lines = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8").splitlines()
+    lines = (ROOT / "docs" / "notes" / "reliability.md").read_text(encoding="utf-8").splitlines()
     rows = [line for line in lines if line.startswith("| ")][1:]  # without the header
     assert len(rows) > 10
     named = [re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row) for row in rows]

@@ -1,14 +1,12 @@
-"""The recipes for other programs: the example files are what the script makes, and the page's commands take them."""
+"""The recipes for other programs: the example files are what the script makes, and mvseg reads them."""
 
 from __future__ import annotations
 
 import json
 import re
 import runpy
-import shlex
 import shutil
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -22,8 +20,7 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 
 ROOT = Path(__file__).parent.parent
 NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-?\d+)?")
-PAGE = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
-COMMANDS = re.findall(r"^(mvseg check .*docs/recipes/.*)$", PAGE, re.MULTILINE)
+MASKS = ("sam", "cvat/instances_default.json", "roboflow/_annotations.coco.json")
 
 
 def test_example_files_are_what_the_script_makes(tmp_path: Path) -> None:
@@ -42,27 +39,21 @@ def test_example_files_are_what_the_script_makes(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", COMMANDS)
-def test_commands_of_the_recipes_run(
-    command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(ROOT)
-    words = shlex.split(command.replace("$plant", str(demo_scene())))
-    assert main([*words[1:], "--quiet"]) == 0
-    said = capsys.readouterr().out
-    assert re.search(r"; (36|108) masks\n", said)  # 12 in each of three or nine photos
-    assert len(COMMANDS) == 5
+@pytest.mark.parametrize("name", [*MASKS, "metashape", "colmap"])
+def test_example_files_are_read(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path, plant = recipe_files.FOLDER / name, demo_scene()
+    scene, masks = (plant, path) if name in MASKS else (path, plant / "masks")
+    assert main(["check", str(scene), "--masks", str(masks), "--quiet"]) == 0
+    assert re.search(r"; (36|108) masks\n", capsys.readouterr().out)  # 12 in each of three or nine photos
 
 
 def test_of_all_that_sam_finds_the_leaves_are_kept(tmp_path: Path) -> None:
-    """By the function on the page: without it, background, plant and halves are masks, too."""
-    (code,) = (block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL) if "def keep_leaves" in block)
-    scope: dict[str, Any] = {}
-    exec(code, scope)
+    """By the script's function: without it, background, plant and halves are masks, too."""
+    keep_leaves = runpy.run_path(str(ROOT / "docs" / "recipes" / "sam2_masks.py"))["keep_leaves"]
     scene = load_scene(demo_scene())
     for view, (width, height) in zip(scene.views, scene.cameras.sizes.tolist(), strict=True):
         found = recipe_files.sam_entries(read_label_png(demo_scene() / "masks" / f"{view.name}.png", width, height))
-        kept = scope["keep_leaves"](found, width * height)
+        kept = keep_leaves(found, width * height)
         (tmp_path / f"{view.name}.json").write_text(json.dumps(kept))
     given, kept = (load_masks(scene, folder) for folder in (demo_scene() / "masks", tmp_path))
     assert kept.num_per_view.tolist() == given.num_per_view.tolist()

@@ -1,7 +1,7 @@
 """The numbers of the checks: definitions, technical limits, and thresholds from which a user is told.
 
 Those of poses were chosen on 96 development scenes, 48 simulated plants with true and with degraded masks, with eight
-faults in each, so that no sound view was off: docs/check.md.
+faults in each, so that no sound view was off: docs/notes/check.md.
 A unit is one pixel, or more where photos are large: see `Cameras.unit_px`.
 """
 

@@ -1,4 +1,4 @@
-"""The file of corrections: what the user says is wrong, photo by photo; see docs/corrections.md.
+"""The file of corrections: what the user says is wrong, photo by photo; see docs/formats.md.
 
 An edit names things by points, in pixels of the photo as the user has it (with its distortion, the centre of the
 top-left pixel at 0.5, 0.5), never by numbers of a result: numbers change with every run, points do not.

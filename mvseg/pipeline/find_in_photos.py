@@ -1,8 +1,7 @@
 """Leaves in the photos: the detector looks, at the size at which the views agree best, and the views choose.
 
 A detector knows leaves of some sizes in pixels. Scores do not reveal which sizes work on a new plant; agreement between
-views does. The agreed area (`rate_pass`) orders sizes nearly as the truth does (docs/notes/detector.md). Not in the
-paper.
+views does: the agreed area (`rate_pass`) orders sizes nearly as the truth does. Not in the paper.
 """
 
 from __future__ import annotations
@@ -114,8 +113,8 @@ def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> list[Pl
 
 
 def order_sizes(results: Sequence[Plant]) -> list[Plant]:
-    """The best pass, see `order_ratings`. Then the next one, if its agreed area is at least `DETECTION.as_good` times as
-    large: the caller decides between the two by all views."""
+    """The best pass, see `order_ratings`; then the next, if its agreed area is at least `DETECTION.as_good` times as
+    large, for the caller to decide between the two by all views."""
     first, *others = [results[index] for index in order_ratings([each.rating for each in results])]
     least = DETECTION.as_good * first.rating.agreed_area
     return [first, *(each for each in others[:1] if each.rating.agreed_area >= least)]

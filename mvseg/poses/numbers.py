@@ -1,6 +1,6 @@
 """The numbers of poses: definitions, technical limits, and thresholds, with what a third less or more does to photos.
 
-They are read for --help, too: this module loads no torch. docs/pose.md says what cameras they give.
+They are read for --help, too: this module loads no torch. docs/notes/pose.md says what cameras they give.
 """
 
 from __future__ import annotations

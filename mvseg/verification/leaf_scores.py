@@ -234,15 +234,12 @@ def order_ratings(ratings: Sequence[Rating]) -> list[int]:
     The area alone has a degenerate optimum: the whole plant as one leaf. So passes with too few leaves
     (`CHOICE.least_leaves`) or too few correct masks (`CHOICE.least_expected`) are no answers, unless all are so.
     """
-    most = max((each.expected for each in ratings), default=0.0)
-    every = range(len(ratings))
-    is_answer = [
-        each.num_leaves >= CHOICE.least_leaves and each.expected >= CHOICE.least_expected * most for each in ratings
-    ]
-    answers = [index for index in every if is_answer[index]] or [*every]
-    largest = max((ratings[index].agreed_area for index in answers), default=0.0)
-    best = next((index for index in answers if CHOICE.growth * ratings[index].agreed_area >= largest), None)
-    return sorted(answers, key=lambda index: (index != best, -ratings[index].agreed_area))
+    least = CHOICE.least_expected * max((each.expected for each in ratings), default=0.0)
+    is_answer = [each.num_leaves >= CHOICE.least_leaves and each.expected >= least for each in ratings]
+    answers = np.flatnonzero(is_answer if any(is_answer) else np.ones(len(ratings)))
+    areas = np.array([each.agreed_area for each in ratings])
+    first = next(iter(answers[CHOICE.growth * areas[answers] >= areas[answers].max(initial=0.0)]), None)
+    return sorted(answers.tolist(), key=lambda index: (index != first, -areas[index]))
 
 
 def log_odds(values: Floats) -> Floats:

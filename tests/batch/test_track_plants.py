@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import runpy
 import shutil
 from pathlib import Path
 from typing import Any
@@ -195,20 +196,16 @@ def test_a_batch_without_two_dates_is_refused(tmp_path: Path) -> None:
         list_plants(batch)
 
 
-def test_the_growth_model_of_the_docs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_growth_model_of_the_docs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = [str(tmp_path / f"day-{day}") for day in range(6)]
     sizes = [1 / (1 + np.exp(-0.8 * (day - 2))) for day in range(6)]
     for name, size in zip(names, sizes, strict=True):
         write_result(Path(name), grown(BLADES, float(0.7 + 0.3 * size)))
     times = [str(day) for day in range(6)]
     assert main(["track", *names, "--times", *times, "--out", str(tmp_path / "tracks"), "--quiet"]) == 0
-    page = (Path(__file__).parents[2] / "docs" / "tracking.md").read_text(encoding="utf-8")
-    (model,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    monkeypatch.chdir(tmp_path)
     assert capsys.readouterr().out.endswith(f"mvseg: look at: {tmp_path / 'tracks' / 'tracks.html'}\n")
-    exec(model, {})
+    fit = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "recipes" / "growth.py"))["main"]
+    fit(tmp_path / "tracks" / "growth.csv")
     assert len(re.findall(r"^tracks \d+ \[", capsys.readouterr().out, re.MULTILINE)) == 7
 
 
