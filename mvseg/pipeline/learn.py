@@ -84,15 +84,15 @@ def learn(
 
 
 def _count_rounds(plant: Plant) -> int:
-    """Number of rounds to try. With "auto", none where the detector knows the species: the views agree about its
-    leaves, most of these score well, and its own size is the best one."""
+    """Number of rounds to try. With "auto", none where the detector knows the species: most leaves score well, and its
+    own size is the best one. Hardly any agreement is no reason: known plants that were taught for it lost."""
     opened = plant.opened
     if opened.holds or opened.config.learn == "off":
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    is_sure = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not plant.agreement < DETECTION.agreement
-    return 0 if is_sure and not _is_smaller(plant) else ROUNDS
+    is_known = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not _is_smaller(plant)
+    return 0 if is_known else ROUNDS
 
 
 def _is_smaller(plant: Plant) -> bool:
