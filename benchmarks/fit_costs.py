@@ -62,7 +62,7 @@ def known_pairs(dates: list[PlantOnDate], truth: Labels) -> list[Known]:
             one, other = (np.flatnonzero(true[date] > 0) for date in (earlier, later))
             ids = true[earlier][one], true[later][other]
             days = dates[later].time - dates[earlier].time
-            pair = Pair.of(leaves[earlier].take(one), leaves[later].take(other), days=days, knows_up=knows_up)
+            pair = Pair.of(leaves[earlier].select(one), leaves[later].select(other), days=days, knows_up=knows_up)
             pairs = np.argwhere(ids[0][:, None] == ids[1])
             if len(pairs):
                 found.append((pair.moved(_true_pose(pair, pairs)), *ids))

@@ -23,7 +23,7 @@ class Crop:
 
     @staticmethod
     def of(mask: Tensor | np.ndarray, corner: tuple[int, int] = (0, 0)) -> Crop:
-        """The tight crop of a mask (H, W) bool with a pixel or more, whose top-left pixel is at `corner` x, y."""
+        """The tight crop of a mask (H, W) bool whose top-left pixel is at `corner` x, y, see `tighten`."""
         pixels, (x, y) = torch.as_tensor(mask), corner
         return Crop((x, y, x + pixels.shape[1], y + pixels.shape[0]), pixels).tighten()
 
@@ -56,11 +56,13 @@ class Crop:
         return self.within((0, 0, *size)).pixels
 
     def tighten(self) -> Crop:
-        """The same mask, which must have a pixel, in the smallest box."""
+        """The same mask in the smallest box; where it has no pixel, that of the top-left one, which is not set."""
         rows, columns = (self.pixels.any(axis).nonzero()[:, 0] for axis in (1, 0))
+        if not len(rows):
+            rows = columns = torch.zeros(1, dtype=torch.int64)
         (left, right), (top, bottom) = columns[[0, -1]].tolist(), rows[[0, -1]].tolist()
         box = (self.box[0] + left, self.box[1] + top, self.box[0] + right + 1, self.box[1] + bottom + 1)
-        return Crop(box, self.pixels[top : bottom + 1, left : right + 1])
+        return Crop(box, self.pixels[top : bottom + 1, left : right + 1].clone())  # a view would hold the whole frame
 
     def union(self, *others: Crop) -> Crop:
         """Union of the mask and others, in the box around all."""

@@ -128,7 +128,7 @@ def check_ranges(config: object, place: str = "", /, **ranges: tuple[float, floa
         value = getattr(config, name)
         if isinstance(value, int | float) and not (low <= value <= high and value != math.inf):
             expected = f"at least {low}" if high == math.inf else f"a number from {low} to {high}"
-            raise InputError(f"{place}.{name} is {value}, expected {expected}".removeprefix("."))
+            raise InputError(f"{place}.{name} is {value:.12g}, expected {expected}".removeprefix("."))
 
 
 def check_choices(config: object, place: str = "") -> None:

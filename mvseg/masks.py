@@ -6,9 +6,9 @@ A stage takes `Masks` and gives `Masks` back; nothing about a mask is kept anywh
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
+from typing import Self
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torch import Tensor
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.regions import Regions, stack_regions
+from mvseg.table import Table
 
 STEM_CLASS = 2  # definition: class of given masks of stems; leaves have 1
 SURE = 0.5  # definition: match score, or q, from which a mask likelier shows an instance than not
@@ -33,7 +34,7 @@ class Origin(IntEnum):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Masks:
+class Masks(Table):
     """D masks in V views.
 
     Attributes:
@@ -63,9 +64,9 @@ class Masks:
         return f"Masks({len(self)} in {self.regions.num_views} views, of {self.num_instances} instances)"
 
     def __post_init__(self) -> None:
-        lengths = [len(getattr(self, name)) for name in COLUMNS]
-        if lengths != [len(self.regions)] * len(lengths):
-            raise InputError(f"{len(self.regions)} regions with columns of {lengths} rows, expected one row each")
+        first, *lengths = map(len, self.columns.values())
+        if {first, *lengths} != {first}:
+            raise InputError(f"{first} regions with columns of {lengths} rows, expected one row each")
 
     @staticmethod
     def of(
@@ -91,9 +92,6 @@ class Masks:
             proposal=torch.arange(count, device=device),
         )
 
-    def __len__(self) -> int:
-        return len(self.regions)
-
     @property
     def view_index(self) -> Tensor:
         """(D,) int64, the view of each."""
@@ -105,22 +103,17 @@ class Masks:
         return self.origin >= Origin.CORRECTED
 
     @property
+    def is_edited(self) -> Tensor:
+        """(D,) bool: an edit is about it."""
+        return self.is_corrected | self.is_linked
+
+    @property
     def num_instances(self) -> int:
         """K, the largest id."""
         return max(int(self.instance_ids.max()), 0) if len(self) else 0
 
-    def to(self, device: torch.device | str) -> Masks:
-        columns: dict[str, Any] = {name: getattr(self, name).to(device) for name in COLUMNS}
-        return replace(self, regions=self.regions.to(device), **columns)
-
-    def select(self, index: Tensor) -> Masks:
-        """The rows at an int64 index or a bool mask, in that order; ids stay what they are."""
-        keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in COLUMNS}
-        return replace(self, regions=self.regions.select(index), **columns)
-
-    @staticmethod
-    def concatenate(parts: Sequence[Masks]) -> Masks:
+    @classmethod
+    def concatenate(cls, parts: Sequence[Self]) -> Self:
         """The rows of one or more tables of the same views, one after another.
 
         No instance is shared by two parts: the ids of each follow those of the parts before it.
@@ -130,8 +123,7 @@ class Masks:
             ids = torch.where(part.instance_ids > 0, part.instance_ids + largest, -1)
             shifted.append(replace(part, instance_ids=ids))
             largest += part.num_instances
-        columns: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in shifted]) for name in COLUMNS}
-        return Masks(Regions.concatenate([part.regions for part in parts]), **columns)
+        return super().concatenate(shifted)
 
     def count_sure_views(self) -> Tensor:
         """(K,) int64: in how many views a mask of each instance has a match score of at least 0.5."""
@@ -141,12 +133,7 @@ class Masks:
         return seen.sum(1)
 
 
-COLUMNS = tuple(each.name for each in fields(Masks) if each.name != "regions")
-
-
 def replace_crops(masks: Masks, crops: Sequence[Crop]) -> Masks:
     """The same D rows with other pixels, on the CPU."""
-    labels, num_views = masks.regions.labels.tolist(), masks.regions.num_views
-    boxes, pixels = [each.box for each in crops], [each.pixels.flatten() for each in crops]
-    regions = stack_regions(masks.view_index.tolist(), boxes, pixels, labels=labels, num_views=num_views)
-    return replace(masks.to("cpu"), regions=regions)
+    rows = zip(masks.view_index.tolist(), crops, masks.regions.labels.tolist(), strict=True)
+    return replace(masks.to("cpu"), regions=stack_regions([*rows], masks.regions.num_views))

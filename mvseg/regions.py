@@ -16,13 +16,13 @@ from torch import Tensor
 
 from mvseg.crop import Box, Crop
 from mvseg.errors import InputError
+from mvseg.table import Table
 
-REGION_COLUMNS = ("view_index", "boxes", "crops", "labels")
 IGNORE_LABEL = 65535  # definition: in label maps: pixels that belong to no region and are left out of every score
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Regions:
+class Regions(Table):
     """D instance masks in V views: the nodes of the paper's graph (Sec. 3.1).
 
     A mask is kept as the crop of its bounding box, never as a full frame; the crops of all regions stand one after
@@ -59,16 +59,6 @@ class Regions:
             raise InputError(f"crops hold {len(self.crops)} pixels, expected bool, as many as the boxes cover")
         if num_regions and not 0 <= int(self.view_index.min()) <= int(self.view_index.max()) < self.num_views:
             raise InputError(f"a region's view index is not in [0, {self.num_views})")
-
-    def __len__(self) -> int:
-        return len(self.view_index)
-
-    @property
-    def device(self) -> torch.device:
-        return self.boxes.device
-
-    def to(self, device: torch.device | str) -> Regions:
-        return replace(self, **{name: getattr(self, name).to(device) for name in REGION_COLUMNS})
 
     @property
     def crop_sizes(self) -> Tensor:
@@ -134,22 +124,10 @@ class Regions:
         """(height, width) bool: one region as a full frame, for drawing and writing."""
         return self.placed(index).paste((width, height))
 
-    def select(self, index: Tensor) -> Regions:
-        """The regions at an int64 index or a bool mask, in that order."""
-        if index.dtype == torch.bool and len(index) != len(self):
-            raise InputError(f"a bool index of {len(index)} for {len(self)} regions, expected one per region")
-        keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        ends = torch.stack((self.offsets[:-1][keep], self.offsets[1:][keep]), 1).tolist()
-        crops = torch.cat([self.crops[start:end] for start, end in ends]) if len(keep) else self.crops[:0]
-        view_index, boxes, labels = self.view_index[keep], self.boxes[keep], self.labels[keep]
-        return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
-
-    @staticmethod
-    def concatenate(parts: Sequence[Regions]) -> Regions:
-        """The regions of one or more tables of the same views, one after another."""
-        names = REGION_COLUMNS
-        columns: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in parts]) for name in names}
-        return replace(parts[0], **columns)
+    def _pick_rows(self, index: Any) -> dict[str, Any]:
+        ends = torch.stack((self.offsets[:-1][index], self.offsets[1:][index]), 1).tolist()
+        crops = [self.crops[:0], *(self.crops[start:end] for start, end in ends)]
+        return super()._pick_rows(index) | {"crops": torch.cat(crops)}
 
     def of_views(self, views: Tensor) -> Regions:
         """The regions of the views at (S,) int64, each named once, as those of views 0 to S - 1; by view."""
@@ -266,7 +244,7 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Region
     Raises:
         InputError: something else than such an array.
     """
-    rows: list[tuple[int, Box, Tensor, int]] = []
+    rows: list[tuple[int, Crop, int]] = []
     num_views = 0
     for view, given in enumerate(label_maps):
         label_map: object = given.detach().cpu().numpy() if isinstance(given, Tensor) else given
@@ -274,11 +252,10 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray | Tensor]) -> Region
             kind = f"{type(label_map).__name__} {getattr(label_map, 'shape', '')} {getattr(label_map, 'dtype', '')}"
             raise InputError(f"view {view}: the label map is a {kind.strip()}, expected an integer array (H, W)")
         num_views = view + 1
-        for number, box in label_boxes(label_map).items():
-            x1, y1, x2, y2 = box
-            rows.append((view, box, torch.from_numpy(label_map[y1:y2, x1:x2] == number).flatten(), number))
-    view_index, boxes, crops, labels = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
+        for number, (x1, y1, x2, y2) in label_boxes(label_map).items():
+            crop = Crop((x1, y1, x2, y2), torch.from_numpy(label_map[y1:y2, x1:x2] == number))
+            rows.append((view, crop, number))
+    return stack_regions(rows, num_views)
 
 
 def _slices(box: np.ndarray) -> tuple[slice, slice]:
@@ -300,14 +277,13 @@ def label_boxes(label_map: np.ndarray) -> dict[int, Box]:
     return boxes
 
 
-def stack_regions(
-    view_index: Sequence[int], boxes: Sequence[Box], crops: Sequence[Tensor], *, labels: Sequence[int], num_views: int
-) -> Regions:
-    """Regions from one entry per region: see `Regions`; `crops` are flat bool tensors. All sequences may be empty."""
+def stack_regions(rows: Sequence[tuple[int, Crop, int]], num_views: int) -> Regions:
+    """Regions from the view, the mask and the label of each, on the CPU; there may be none."""
+    view_index, crops, labels = zip(*rows, strict=True) if rows else ((), (), ())
     return Regions(
         view_index=torch.tensor(view_index, dtype=torch.int64),
-        boxes=torch.tensor(boxes, dtype=torch.int64).reshape(-1, 4),
-        crops=torch.cat(list(crops)) if len(crops) else torch.zeros(0, dtype=torch.bool),
+        boxes=torch.tensor([each.box for each in crops], dtype=torch.int64).reshape(-1, 4),
+        crops=torch.cat([torch.zeros(0, dtype=torch.bool), *(each.pixels.flatten() for each in crops)]),
         num_views=num_views,
         labels=torch.tensor(labels, dtype=torch.int64),
     )

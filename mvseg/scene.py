@@ -32,6 +32,7 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.table import Table
 
 if TYPE_CHECKING:
     import pycolmap
@@ -44,7 +45,7 @@ MAX_WORLD = 1e12  # limit: of t, world units: millimetres on a map of the whole 
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Cameras:
+class Cameras(Table):
     """V pinhole cameras with known poses.
 
     Attributes:
@@ -80,23 +81,11 @@ class Cameras:
             if problem := camera_problem(self.K[index], self.R[index], self.t[index], size=self.sizes[index]):
                 raise InputError(f"view {index}: {problem}")
 
-    def __len__(self) -> int:
-        return len(self.K)
-
     def __getitem__(self, index: Any) -> Cameras:
         """The cameras at a slice, a list or a tensor of view indices; of one view: `cameras[[0]]`."""
         if isinstance(index, int):
             raise InputError(f"cameras[{index}] asks for a single camera, expected a list: cameras[[{index}]]")
-        return Cameras(K=self.K[index], R=self.R[index], t=self.t[index], sizes=self.sizes[index])
-
-    @property
-    def device(self) -> torch.device:
-        return self.K.device
-
-    def to(self, device: torch.device | str) -> Cameras:
-        if self.device == torch.device(device):  # they need no second check
-            return self
-        return Cameras(K=self.K.to(device), R=self.R.to(device), t=self.t.to(device), sizes=self.sizes.to(device))
+        return replace(self, **self._pick_rows(index))
 
     @property
     def centers(self) -> Tensor:

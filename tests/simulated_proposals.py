@@ -25,11 +25,8 @@ def simulate_proposals(
     """
     rng = np.random.default_rng(seed)
     truth = regions_from_label_maps(label_maps)
-    view_index: list[int] = []
-    boxes: list[tuple[int, int, int, int]] = []
-    crops: list[Tensor] = []
-    scores, labels = [], []
-    areas = truth.areas.tolist()
+    rows = list[tuple[int, Crop, int]]()
+    scores, areas = [], truth.areas.tolist()
     for index, view in enumerate(truth.view_index.tolist()):
         height, width = label_maps[view].shape
         mask = truth.mask(index, width, height).numpy()
@@ -39,14 +36,10 @@ def simulate_proposals(
             moved = _move_mask(mask, truth.boxes[index].numpy(), error=error, grow_px=int(rng.integers(-2, 3)))
             if not moved.any():
                 continue
-            x1, y1, x2, y2 = Crop.of(moved).box
-            view_index.append(view)
-            boxes.append((x1, y1, x2, y2))
-            crops.append(torch.from_numpy(moved[y1:y2, x1:x2].copy()).flatten())
+            rows.append((view, Crop.of(moved), int(truth.labels[index])))
             quality = float(np.exp(-np.square(error).sum() / (4 * jitter**2)))
             scores.append(0.2 + 0.4 * prominence + 0.3 * quality + 0.1 * rng.random())
-            labels.append(int(truth.labels[index]))
-    regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
+    regions = stack_regions(rows, len(label_maps))
     return Masks.of(regions, detection_scores=torch.tensor(scores), origin=Origin.DETECTED), regions.labels
 
 

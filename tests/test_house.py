@@ -36,7 +36,7 @@ PACKAGE = ROOT / "mvseg"
 FLOORS = (
     ("findings", "arrays", "_version"),
     ("errors",),
-    ("system",),
+    ("system", "table"),
     ("scene", "crop"),
     ("regions",),
     ("masks", "demo"),
@@ -118,8 +118,8 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 37_666, "benchmarks": 6_720, "tests": 33_593}
-SLACK, MOST_CODE = 400, 21_814
+BUDGET = {"mvseg": 37_516, "benchmarks": 6_718, "tests": 33_589}
+SLACK, MOST_CODE = 400, 21_655
 
 
 @pytest.mark.parametrize("place", BUDGET)

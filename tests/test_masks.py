@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
+from blade_scene import ring_cameras
 from matched import matched
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.masks import Masks, Origin, replace_crops
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.regions import regions_from_label_maps
+from mvseg.table import Table
 
 
 def table() -> Masks:
@@ -30,29 +34,41 @@ def table() -> Masks:
     )
 
 
-def same(first: Masks, second: Masks) -> bool:
-    names = ("instance_ids", "match_scores", "detection_scores", "classes", "origin")
-    columns = all(torch.equal(getattr(first, name), getattr(second, name)) for name in names)
-    return columns and torch.equal(first.regions.crops, second.regions.crops)
+def stack() -> MaskStack:
+    """Masks of one leaf in five views."""
+    masks = [np.pad(np.ones((12, 12 + view), bool), 6) for view in range(5)]
+    others = [0 * mask.astype(np.int32) for mask in masks]
+    return stack_masks(masks, others, range(5), px_from_world=np.tile(np.eye(3, 4), (5, 1, 1)))
 
 
-def test_selected_rows_keep_what_is_known_of_them() -> None:
-    chosen = table().select(torch.tensor([4, 2]))
-    assert chosen.instance_ids.tolist() == [3, 2]
-    assert chosen.match_scores.tolist() == pytest.approx([0.6, 0.4])
-    assert chosen.view_index.tolist() == [2, 1]
-    assert same(table().select(table().match_scores >= 0), table())
+def same(one: Table, other: Table) -> bool:
+    pairs = [(getattr(one, each.name), getattr(other, each.name)) for each in fields(one)]
+    return all(same(a, b) if isinstance(a, Table) else np.array_equal(np.asarray(a), np.asarray(b)) for a, b in pairs)
 
 
-def test_a_permutation_and_its_inverse_are_nothing() -> None:
-    order = torch.tensor([3, 0, 4, 1, 2])
-    assert same(table().select(order).select(order.argsort()), table())
+UNMATCHED = replace(table(), instance_ids=torch.full((5,), -1))
+
+
+@pytest.mark.parametrize("rows", [UNMATCHED, UNMATCHED.regions, ring_cameras(5), stack()], ids=lambda each: type(each))
+def test_the_columns_of_all_tables_move_together(rows: Table) -> None:
+    index: Any = np.array if isinstance(rows, MaskStack) else torch.tensor
+    order = index([3, 0, 4, 1, 2])
+    assert not same(rows.select(order), rows)
+    assert same(rows.select(order).select(order.argsort()), rows)
+    assert same(rows.select(order >= 0), rows)
+    with pytest.raises(InputError, match="a bool index of 4 for 5 rows, expected one per row"):
+        rows.select(order[:4] >= 0)
+    with pytest.raises(IndexError):
+        rows.select(index([5]))
+    if not isinstance(rows, MaskStack):  # these are padded, see `join_stacks`
+        joined = rows.concatenate([rows, rows.select(order)])
+        assert same(joined.select(order), rows.select(order))
+        assert same(joined.select(torch.arange(5, 10)), rows.select(order).to("cpu"))
 
 
 def test_concatenated_tables_share_no_instance() -> None:
     joined = Masks.concatenate([table(), table()])
     assert joined.instance_ids.tolist() == [2, 1, 2, -1, 3, 5, 4, 5, -1, 6]
-    assert same(Masks.concatenate([table()]), table())
 
 
 def test_reports_are_joined() -> None:

@@ -122,18 +122,6 @@ def test_thinned_and_spread_pixels_agree_with_full_frames(most: int) -> None:
     assert [len(each) for each in (*thinned_pixels(nothing, 5), *nothing.spread_pixels(5))] == [0] * 4
 
 
-def test_select_keeps_order_and_content() -> None:
-    regions = regions_from_label_maps(random_maps())
-    index = torch.tensor([4, 0, 5])
-    chosen = regions.select(index)
-    for position, source in enumerate(index.tolist()):
-        assert torch.equal(chosen.crop(position), regions.crop(source))
-        assert chosen.labels[position] == regions.labels[source]
-    everything = regions.select(torch.ones(len(regions), dtype=torch.bool))
-    assert torch.equal(everything.crops, regions.crops)
-    assert len(regions.select(torch.zeros(len(regions), dtype=torch.bool))) == 0
-
-
 def test_regions_of_some_views_are_those_of_their_label_maps() -> None:
     maps = random_maps()
     for views in ([2, 0], [1], [0, 1, 2]):

@@ -63,20 +63,15 @@ def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detecto
     from mvseg.detectors.zoo import load_detector
 
     model = load_detector(detector)
-    view_index, boxes, crops = [], [], []
+    rows = list[tuple[int, Crop, int]]()
     with torch.no_grad():
         for view, photo in enumerate(photos):
             detections, pasted = detect(model, photo)
             for score, soft in zip(detections["scores"].tolist(), pasted, strict=True):
-                mask = soft > 0.5
-                if score < DetectConfig.min_score or int(mask.sum()) < MIN_PIXELS:
-                    continue
-                x1, y1, x2, y2 = Crop.of(mask).box
-                view_index.append(view)
-                boxes.append((x1, y1, x2, y2))
-                crops.append(mask[y1:y2, x1:x2].flatten())
-    regions = stack_regions(view_index, boxes, crops, labels=range(len(crops)), num_views=len(truth))
-    return tie_detections(regions, truth)
+                mask = Crop.of(soft > 0.5)
+                if score >= DetectConfig.min_score and mask.area >= MIN_PIXELS:
+                    rows.append((view, mask, len(rows)))
+    return tie_detections(stack_regions(rows, len(truth)), truth)
 
 
 def most_shown(regions: Regions, truth: Sequence[np.ndarray]) -> Tensor:

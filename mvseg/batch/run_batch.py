@@ -45,7 +45,7 @@ def run_batch(
     num_workers: int = 1,
     part: tuple[int, int] | None = None,
 ) -> BatchCounts:
-    """From scene folders to result folders `out/NAME` and the tables in `out/tables`. Failures are reported on stderr.
+    """From scene folders to result folders, by name, and the tables in `out/tables`. Failures are reported on stderr.
 
     Args:
         masks: in each scene folder, or beside them; None: a detector finds them.

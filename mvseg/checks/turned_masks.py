@@ -57,11 +57,9 @@ def take_out_of_square(regions: Regions, cameras: Cameras) -> Regions:
         size = max(int(box[2] - box[0]), 1), max(int(box[3] - box[1]), 1)
         crop = cv2.resize(regions.crop(index).numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         moved = Crop((*box.tolist()[:2], int(box[0]) + size[0], int(box[1]) + size[1]), torch.from_numpy(crop > 0))
-        inside = moved.within((0, 0, width, height))
-        crops.append(inside.tighten() if inside.pixels.any() else Crop((0, 0, 1, 1), inside.pixels[:1, :1]))
-    boxes, pixels = [each.box for each in crops], [each.pixels.flatten() for each in crops]
-    labels, views = regions.labels.tolist(), regions.view_index.tolist()
-    return stack_regions(views, boxes, pixels, labels=labels, num_views=regions.num_views)
+        crops.append(moved.within((0, 0, width, height)).tighten())
+    rows = zip(regions.view_index.tolist(), crops, regions.labels.tolist(), strict=True)
+    return stack_regions([*rows], regions.num_views)
 
 
 def transpose(regions: Regions, _: Cameras) -> Regions:

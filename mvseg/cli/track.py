@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import replace
 from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,7 +73,7 @@ def _read_again(args: Namespace) -> RecordedTracks:
         message = f"--again repeats the run of {args.again} with its results, times and pots"
         raise InputError(f"{message}, expected no others")
     sweep_abandoned(args.again)
-    return replace(read_recorded_tracks(args.again), folder=args.out or args.again)
+    return read_recorded_tracks(args.again).model_copy(update={"folder": args.out or args.again})
 
 
 def _read_results(args: Namespace) -> RecordedTracks:
@@ -97,7 +96,7 @@ def _read_results(args: Namespace) -> RecordedTracks:
             raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
         name = args.plant or _name_plant(results) or out.resolve().name
         plants = [PlantResults(plant=name, results=tuple(results), times=tuple(times))]
-    return RecordedTracks(out, tuple(plants), args.pots, corrections=None)
+    return RecordedTracks(folder=out, plants=tuple(plants), pots=args.pots)
 
 
 def _name_plant(results: Sequence[Path]) -> str:

@@ -80,13 +80,8 @@ def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
         labels = torch.where(is_new, 0, masks.regions.labels[chosen])
         is_same = torch.tensor([_is_untouched(mask, masks) for mask in made])
         proposal = torch.where(is_same, masks.proposal[chosen], proposal)
-    regions = stack_regions(
-        [mask.view for mask in made],
-        [mask.crop.box for mask in made],
-        [mask.crop.pixels.flatten() for mask in made],
-        labels=labels.tolist(),
-        num_views=masks.regions.num_views,
-    )
+    of_made = [(mask.view, mask.crop, label) for mask, label in zip(made, labels.tolist(), strict=True)]
+    regions = stack_regions(of_made, masks.regions.num_views)
     return replace(Masks.of(regions, classes=classes, detection_scores=scores), origin=origin, proposal=proposal)
 
 

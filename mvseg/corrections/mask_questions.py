@@ -83,7 +83,7 @@ def list_mask_questions(
     questions += _ask_masks(masks, surfaces_of, num_views, size=size) + _ask_rejected(rejected, is_taken, usual=usual)
     if photos is not None:
         questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=QUESTIONS.half * usual), usual=usual)
-    is_settled, asked, queue = (masks.is_corrected | masks.is_linked).tolist(), set[tuple[str, int]](), []
+    is_settled, asked, queue = masks.is_edited.tolist(), set[tuple[str, int]](), []
     for each in sorted(questions, key=_order):
         if each.kind == "leaf" and each.region >= 0:
             names = {("mask", each.region), ("leaf", each.instance)} - {("leaf", -1)}
@@ -118,7 +118,7 @@ def _ask_masks(
     """Ask about masks of no leaf, masks that score low or that the leaf's surface explains badly, and the masks of
     leaves with masks in few of the views that should show them: such a leaf may be none in any view."""
     questions, ids = [], masks.instance_ids.tolist()
-    certain = {*masks.instance_ids[masks.is_corrected | masks.is_linked].tolist(), -1}
+    certain = {*masks.instance_ids[masks.is_edited].tolist(), -1}
     wrong = torch.where(masks.instance_ids > 0, 1 - masks.match_scores, torch.tensor(size)).tolist()
     for instance, surface in surfaces.items():
         fits = dict(zip(surface.views.tolist(), surface.iou.nan_to_num(1.0).tolist(), strict=True))

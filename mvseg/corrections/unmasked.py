@@ -73,6 +73,4 @@ def _widest_place(part: Bools) -> Bools:
     distance = cv2.distanceTransform(np.pad(part.astype(np.uint8), 1), cv2.DIST_L2, 5)[1:-1, 1:-1]
     row, column = np.unravel_index(int(distance.argmax()), part.shape)
     rows, columns = np.ogrid[: part.shape[0], : part.shape[1]]
-    near: Bools = np.hypot(rows - row, columns - column) <= QUESTIONS.widest * distance[row, column]
-    place: Bools = part & near
-    return place
+    return np.asarray(part & (np.hypot(rows - row, columns - column) <= QUESTIONS.widest * distance[row, column]))

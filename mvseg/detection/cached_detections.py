@@ -11,11 +11,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors.torch
 from torch import Tensor
@@ -27,6 +27,7 @@ from mvseg.system.atomic import is_partial, lock_folder, write_whole
 CACHED_NAME = re.compile(r"(learned-)?[0-9a-f]{64}\.safetensors")
 SCENE_FILE = ".scene"
 FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,25 +38,20 @@ class CachedDetections:
     folder: Path
     used: set[str] = field(default_factory=set)
 
-    def path(self, photos: Photos, view: int, box: Sequence[int] | None = None, *, made_by: str) -> Path:
-        """The file for the detections in the photo of a view, or in a box (xyxy) of it; the photo must exist.
-
-        `made_by`: the detector and its options, in words that differ when any of them does.
-        """
-        text = json.dumps([*describe_photo(photos, view), made_by, box])
-        return self._use(f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors")
-
-    def learned(self, made_from: str) -> Path:
-        """The file for a detector that has learned, by a text that says all that it depends on."""
-        return self._use(f"learned-{hashlib.sha256(made_from.encode()).hexdigest()}.safetensors")
-
-    def delete_others(self) -> None:
-        """Delete the cached files that this run did not use, and the folder if it is empty then."""
-        delete_cached(self.folder, but=self.used)
-
-    def _use(self, name: str) -> Path:
-        self.used.add(name)
-        return self.folder / name
+    def get(
+        self, made_from: Any, compute: Callable[[], bytes], read: Callable[[Path], T | None], *, kind: str = ""
+    ) -> T:
+        """Read what follows from `made_from` alone, which JSON can write, from its file; where `read` gives None, the
+        file is written first, with the content that is computed."""
+        path = self.folder / f"{kind}{hashlib.sha256(json.dumps(made_from).encode()).hexdigest()}.safetensors"
+        self.used.add(path.name)
+        if (answer := read(path)) is None:
+            content = compute()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, lambda partial: partial.write_bytes(content))
+            answer = read(path)
+            assert answer is not None, f"expected {path.name} as it was written"
+        return answer
 
 
 def describe_photo(photos: Photos, view: int) -> list[Any]:
@@ -66,15 +62,13 @@ def describe_photo(photos: Photos, view: int) -> list[Any]:
     return [photos.sha256(view), photo_bits(scene, view), camera]
 
 
-def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
-    """Cache the detections of one photo: float and int64 tensors on the CPU, see `run_heads`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    content = safetensors.torch.save({key: value.contiguous() for key, value in detections.items()})
-    write_whole(path, lambda partial: partial.write_bytes(content))
+def encode_detections(detections: dict[str, Tensor]) -> bytes:
+    """Content of the file for the detections of one photo: float and int64 tensors, see `run_heads`."""
+    return safetensors.torch.save({key: value.cpu().contiguous() for key, value in detections.items()})
 
 
 def read_detections(path: Path) -> dict[str, Tensor] | None:
-    """Read detections of `write_detections`, the same bits; None where there is nothing, or something else."""
+    """Read detections, the same bits, on the CPU; None where there is nothing, or something else."""
     try:
         detections = safetensors.torch.load(path.read_bytes())
     except (OSError, safetensors.SafetensorError):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
 from mvseg.detection.numbers import DETECTION
-from mvseg.errors import InputError, check_choices
+from mvseg.errors import check_choices, check_ranges
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,6 @@ class DetectConfig:
 
     def __post_init__(self) -> None:
         check_choices(self, "detect")
-        if not 0 <= self.min_score <= 1:
-            raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
-        if self.min_probability is not None and not 0 <= self.min_probability <= 1:
-            raise InputError(f"detect.min_probability is {self.min_probability:g}, expected a number from 0 to 1")
-        if self.image_size is not None and not DETECTION.min_image_size <= self.image_size <= DETECTION.max_image_size:
-            expected = f"at least {DETECTION.min_image_size}, at most {DETECTION.max_image_size}"
-            raise InputError(f"detect.image_size is {self.image_size}, expected {expected}")
-        if self.num_iterations < 0:
-            raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")
+        sizes = DETECTION.min_image_size, DETECTION.max_image_size
+        check_ranges(self, "detect", min_score=(0, 1), min_probability=(0, 1), image_size=sizes)
+        check_ranges(self, "detect", num_iterations=(0, math.inf))

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
 
+import safetensors.torch
 import torch
 from torch import Tensor
 
 from mvseg._version import code_hash
-from mvseg.detection.cached_detections import CachedDetections, read_detections, write_detections
+from mvseg.detection.cached_detections import CachedDetections, describe_photo, encode_detections, read_detections
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.numbers import DETECTION
@@ -124,20 +125,20 @@ def _detect(
     every, scene = [], photos.scene
     device = next(proposer.detector.parameters()).device
     made_by = "" if cache is None else describe_detector(config, proposer, str(device.type))
+
+    def look(view: int, box: Sequence[int]) -> bytes:
+        x1, y1, x2, y2 = box
+        photo = torch.from_numpy(photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
+        return encode_detections(proposer.propose(photo.float().div_(255), image_size=config.image_size))
+
     with timed("detect"):
         for view in progress_bar(range(len(scene.views)), name="detection", unit="view"):
-            whole = [0, 0, *scene.cameras.sizes[view].tolist()]
-            box = None if boxes is None or boxes[view].tolist() == whole else boxes[view].tolist()
-            path = None if cache is None or not photos.exist else cache.path(photos, view, box, made_by=made_by)
-            detections = None if path is None else read_detections(path)
-            if detections is None:
-                x1, y1, x2, y2 = box or whole
-                photo = torch.from_numpy(photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
-                proposals = proposer.propose(photo.float().div_(255), image_size=config.image_size)
-                detections = {key: value.cpu() for key, value in proposals.items()}
-                if path is not None:
-                    write_detections(path, detections)
-            every.append(detections)
+            box = [0, 0, *scene.cameras.sizes[view].tolist()] if boxes is None else boxes[view].tolist()
+            if cache is None or not photos.exist:
+                every.append(safetensors.torch.load(look(view, box)))
+            else:
+                made_from = [*describe_photo(photos, view), made_by, box]
+                every.append(cache.get(made_from, partial(look, view, box), read_detections))
     return Pass(proposer.match_detections, every, scene.cameras, config.min_score, boxes)
 
 

@@ -53,13 +53,9 @@ def match_proposals(
         warnings.simplefilter("always")
         keep = suppress(per_class)
         matching = match_masks(proposals.select(keep), cameras, match, residual_px=residual_px)
-        rematch = partial(
-            match_masks,
-            cameras=cameras,
-            config=match,
-            num_instances=_count_instances(matching.masks) if match.resolved_method == "symnmf" else {},
-            residual_px=matching.report.residual_px,  # of the poses, which stay the same
-        )
+        counts = _count_instances(matching.masks) if match.resolved_method == "symnmf" else {}
+        residual_px = matching.report.residual_px  # of the poses, which stay the same
+        rematch = partial(match_masks, cameras=cameras, config=match, num_instances=counts, residual_px=residual_px)
         for _ in range(num_iterations):
             matched = matching.masks
             ids, _ = assignment(proposals.regions, matched.regions, matched.instance_ids, cameras=cameras)
@@ -68,13 +64,8 @@ def match_proposals(
             caught.clear()
             matching = rematch(proposals.select(keep))
         if num_iterations and matching.report.has_probabilities:
-            stays = backed_by_views(
-                boxes[keep],
-                per_class[keep],
-                matching.instance_ids,
-                match_scores=matching.match_scores,
-                iou_threshold=cluster_iou,
-            )
+            ids, scores = matching.instance_ids, matching.match_scores
+            stays = backed_by_views(boxes[keep], per_class[keep], ids, match_scores=scores, iou_threshold=cluster_iou)
             if not stays.all():
                 caught.clear()
                 matching = rematch(proposals.select(keep[stays]))

@@ -11,6 +11,7 @@ from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, paste_mask_in_image
 from torchvision.models.detection.transform import resize_boxes
 
+from mvseg.crop import Crop
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.mask_cut import CUT
@@ -110,7 +111,7 @@ def gather_proposals(detections: Sequence[dict[str, Tensor]], sizes: list[list[i
         The R proposals, view after view, matched to nothing; `labels` count them. Crops are what torchvision pastes,
         exactly, where it exceeds 0.5. And (R, 4) float32 xyxy, the detector's boxes in the frames of the images.
     """
-    boxes, view_index, windows, crops = [], [], [], []
+    boxes, rows = [], list[tuple[int, Crop, int]]()
     for view, (detected, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
         frame_width, frame_height = detected["frame"].tolist()
         scaled = resize_boxes(detected["boxes"], [frame_height, frame_width], [height, width])
@@ -119,12 +120,9 @@ def gather_proposals(detections: Sequence[dict[str, Tensor]], sizes: list[list[i
             x1, y1 = pasted[:2].clamp(min=0).tolist()
             x2, y2 = min(int(pasted[2]) + 1, width), min(int(pasted[3]) + 1, height)
             local = pasted - torch.tensor([x1, y1, x1, y1], device=pasted.device)
-            crops.append((paste_mask_in_image(mask, local, y2 - y1, x2 - x1) > CUT).flatten())
-            windows.append((x1, y1, x2, y2))
+            pixels = paste_mask_in_image(mask, local, y2 - y1, x2 - x1) > CUT
+            rows.append((view, Crop((x1, y1, x2, y2), pixels.cpu()), len(rows)))
         boxes.append(scaled)
-        view_index += [view] * len(scaled)
-    device = boxes[0].device
-    parts = [crop.cpu() for crop in crops]
-    regions = stack_regions(view_index, windows, parts, labels=range(len(crops)), num_views=len(sizes)).to(device)
+    regions = stack_regions(rows, len(sizes)).to(boxes[0].device)
     scores, classes = (torch.cat([detected[key] for detected in detections]) for key in ("scores", "labels"))
     return Masks.of(regions, detection_scores=scores, classes=classes, origin=Origin.DETECTED), torch.cat(boxes)

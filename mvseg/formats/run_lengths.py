@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, NonNegativeInt
 
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items
 
@@ -29,24 +31,24 @@ def decode_rle(counts: str | list[int], width: int, height: int) -> np.ndarray:
     return np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(width, height).T
 
 
-def decode_crop(counts: str | list[int], width: int, height: int) -> tuple[tuple[int, int, int, int], np.ndarray]:
-    """The bounding box x1, y1, x2, y2 of the mask that `decode_rle` gives, half-open, and its pixels there, (y2 - y1,
-    x2 - x1) bool, without the rest of the image; of a mask without pixels one that is not set, (0, 0, 1, 1). Raises
-    InputError if the counts do not add up to the image."""
+def decode_crop(counts: str | list[int], width: int, height: int) -> Crop:
+    """The tight crop of the mask that `decode_rle` gives, without the rest of the image; of a mask without pixels one
+    that is not set, (0, 0, 1, 1). Raises InputError if the counts do not add up to the image."""
     runs = _read_runs(counts, width, height)
     ends = runs.cumsum()
     stops = ends[1::2]
     starts = ends[::2][: len(stops)]
     starts, stops = starts[stops > starts], stops[stops > starts]
     if not len(stops):
-        return (0, 0, 1, 1), np.zeros((1, 1), bool)
+        return Crop((0, 0, 1, 1), torch.zeros(1, 1, dtype=torch.bool))
     left, right = int(starts[0]) // height, (int(stops[-1]) - 1) // height + 1
     # a run that goes on in the next column holds the bottom of the one and the top of the other
     is_whole = bool((starts // height < (stops - 1) // height).any())
     top, bottom = (0, height) if is_whole else (int((starts % height).min()), int(((stops - 1) % height).max()) + 1)
     borders = np.clip(ends, left * height, right * height) - left * height
     strip = np.repeat(np.arange(len(runs)) % 2 == 1, np.diff(borders, prepend=0))
-    return (left, top, right, bottom), strip.reshape(right - left, height)[:, top:bottom].T
+    pixels = strip.reshape(right - left, height)[:, top:bottom].T
+    return Crop((left, top, right, bottom), torch.from_numpy(pixels.copy()))
 
 
 def shared_neighbours(runs: NDArray[np.int64], width: int, height: int) -> tuple[float, float]:

@@ -50,8 +50,7 @@ class Clusters:
     @property
     def is_alone(self) -> NDArray[np.bool_]:
         """(D,) whether no other region is in the cluster of a region, or it is in none."""
-        is_alone: NDArray[np.bool_] = np.append(self.sizes, 1)[self.ids] < 2
-        return is_alone
+        return np.asarray(np.append(self.sizes, 1)[self.ids] < 2)
 
     def drop_singletons(self) -> Clusters:
         """The same clusters but for those of one region."""

@@ -72,8 +72,7 @@ class ViewGraph:
     @property
     def is_joined(self) -> Bools:
         """(D,) whether a region stays with another one."""
-        is_joined: Bools = np.bincount(self.node, minlength=1)[self.node] > 1
-        return is_joined
+        return np.asarray(np.bincount(self.node, minlength=1)[self.node] > 1)
 
     @property
     def is_linked(self) -> Bools:
@@ -90,8 +89,7 @@ class ViewGraph:
             return self.weights
         Q = np.eye(int(self.node.max()) + 1)[self.node]
         Q = Q / np.sqrt(Q.sum(0))
-        weights: Reals = Q.T @ np.where(self.apart, 0, self.weights) @ Q
-        return weights
+        return np.asarray(Q.T @ np.where(self.apart, 0, self.weights) @ Q)
 
     def part(self, clusters: Clusters) -> Clusters:
         """Clusters without contradictions to links. Nodes of several regions that are in none form one of their own;

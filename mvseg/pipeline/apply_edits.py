@@ -57,19 +57,14 @@ def _match_anew(plant: Plant, corrected: Corrected, previous: Tensor) -> tuple[P
 
     `previous`: (D,) int64 on the CPU, ids of the leaves that stay; -1 for all other masks."""
     masks, rejects = corrected.masks, any(each.rejects for each in corrected.everywhere)
-    is_held = masks.is_corrected | masks.is_linked
-    if not rejects and not bool((is_held & (previous < 1)).any()):
+    if not rejects and not bool((masks.is_edited & (previous < 1)).any()):
         return replace(plant, matching=plant.matching.with_masks(replace(masks, instance_ids=previous))), previous
-    is_known = 2 * int(masks.is_corrected.sum()) <= len(plant.masks)  # else the user's masks tell it better
-    matching = match_masks(
-        masks,
-        plant.scene.cameras,
-        plant.opened.config.match,
-        links=corrected.links,
-        residual_px=plant.matching.report.residual_px if is_known else None,
-    )
+    residual_px, cameras, config = plant.matching.report.residual_px, plant.scene.cameras, plant.opened.config.match
+    if 2 * int(masks.is_corrected.sum()) > len(plant.masks):  # the user's masks tell it better
+        residual_px = None
+    matching = match_masks(masks, cameras, config, links=corrected.links, residual_px=residual_px)
     matched = matching.masks.to("cpu")
-    previous = leave_joined(previous, matched.instance_ids, is_held)
+    previous = leave_joined(previous, matched.instance_ids, masks.is_edited)
     ids = torch.where(previous > 0, previous + matched.num_instances, matched.instance_ids)
     disagreement = plant.opened.find_disagreement(matching)
     matching = matching.with_masks(replace(matched, instance_ids=ids))
@@ -97,7 +92,7 @@ def unchanged_leaves(corrected: Corrected, ids: Tensor, before: Masks) -> Tensor
         ids[[each.row for each in corrected.everywhere if each.rejects]],
         (remaining != all_of).nonzero()[:, 0],
     )
-    named = ids[corrected.masks.is_corrected | corrected.masks.is_linked]
+    named = ids[corrected.masks.is_edited]
     leaves = named[named > 0].unique()
     return leaves[~torch.isin(leaves, torch.cat(changed))]
 
@@ -120,7 +115,7 @@ def _gather_said(plant: Plant, corrected: Corrected, previous: Tensor, masks: Ma
     pairs = [[row_of.get(name, -1) for name in pair] for pair in names[corrected.links.cannot].tolist()]
     apart = torch.tensor([pair for pair in pairs if min(pair) >= 0], dtype=torch.int64).reshape(-1, 2)
     stays = torch.isin(masks.proposal, names[previous > 0])
-    changed = plant.ids_of(before)[(before.is_corrected | before.is_linked) & (previous < 1)].tolist()
+    changed = plant.ids_of(before)[before.is_edited & (previous < 1)].tolist()
     keys = tuple(None if leaf in changed else plant.keys.get(leaf) for leaf in plant.ids_of(masks).tolist())
     gone = plant.editable.proposal.cpu()
     return Edited(masks, keys, stays, gone=gone[~torch.isin(gone, masks.proposal)], apart=apart)

@@ -8,7 +8,7 @@ from dataclasses import replace
 from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import read_stem_marks
-from mvseg.corrections.corrected import APPLIED, NOTHING, Fate, RejectedPixel
+from mvseg.corrections.corrected import APPLIED, NOTHING
 from mvseg.corrections.file import Corrections
 from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
@@ -17,9 +17,7 @@ from mvseg.masks import STEM_CLASS
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.result import Result
-from mvseg.scene import Cameras
 from mvseg.system.running import timed
-from mvseg.verification.choose import RejectedCandidate
 from mvseg.verification.evidence import paint_view
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
@@ -50,9 +48,8 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
     plant = plant if opened.holds else complete_masks(plant)
     shapes = opened.config.reconstruct
     surfaces = None if shapes is None or shapes.shape == "voxels" else fit_leaves(plant, same_segmenter)
-    shown = surfaces or plant.instances.starts
-    rejected, fates = settle_edits(plant.edits, plant.refused, plant.rejected, shown, cameras=plant.scene.cameras)
-    for fate in fates:
+    plant = settle_edits(plant, surfaces or plant.instances.starts)
+    for fate in plant.edits:
         if fate.finding is not None:
             warn(fate.finding)
     return Result(
@@ -60,35 +57,29 @@ def shape_leaves(plant: Plant, *, same_segmenter: Mapping[int, LeafSurface] | No
         matching=plant.matching,
         instances=replace(plant.instances, surfaces=surfaces),
         photos=opened.photos,
-        rejected=rejected,
+        rejected=plant.rejected,
         mask_kind=opened.mask_kind,
         views_left_out=opened.views_left_out,
-        fates=fates,
+        fates=plant.edits,
         learned=plant.learned,
         inputs={str(path.resolve()): sha256 for path, sha256 in opened.inputs.items()},
     )
 
 
-def settle_edits(
-    edits: Sequence[Fate],
-    refused: Sequence[RejectedPixel],
-    rejected: Sequence[RejectedCandidate],
-    surfaces: Mapping[int, LeafSurface],
-    *,
-    cameras: Cameras,
-) -> tuple[tuple[RejectedCandidate, ...], tuple[Fate, ...]]:
+def settle_edits(plant: Plant, surfaces: Mapping[int, LeafSurface]) -> Plant:
     """Apply "no leaf here" edits that point at no mask but answer a question, at a rejected candidate, which goes if
-    the edit is about all photos, or at a surface without a mask. Returns the other candidates and the fates."""
-    gone, answers = set[int](), set[int]()
-    for each in refused:
-        candidates = {n for n, other in enumerate(rejected) if other.masks.regions.at(each.view, each.column, each.row)}
+    the edit is about all photos, or at a surface without a mask."""
+    gone, answers, cameras = set[int](), set[int](), plant.scene.cameras
+    for each in plant.refused:
+        place = each.view, each.column, each.row
+        candidates = {n for n, other in enumerate(plant.rejected) if other.masks.regions.at(*place)}
         gone |= candidates if each.everywhere else set()
         width, height = cameras.sizes[each.view].tolist()
         is_in_photo = 0 <= each.column < width and 0 <= each.row < height
         if candidates or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
             answers.add(each.edit)
-    fates = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in edits)
-    return tuple(other for n, other in enumerate(rejected) if n not in gone), fates
+    edits = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in plant.edits)
+    return replace(plant, edits=edits, rejected=tuple(each for n, each in enumerate(plant.rejected) if n not in gone))
 
 
 def complete_masks(plant: Plant) -> Plant:
@@ -106,15 +97,10 @@ def fit_leaves(plant: Plant, same_segmenter: Mapping[int, LeafSurface] | None) -
     """Fit a surface to the masks of each leaf, see `fit_surfaces`."""
     from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 
+    regions, ids, cameras = plant.masks.regions, plant.masks.instance_ids, plant.scene.cameras
+    starts, cache = plant.instances.starts, plant.opened.cache
     with timed("surfaces"):
-        return fit_surfaces(
-            plant.masks.regions,
-            plant.masks.instance_ids,
-            plant.scene.cameras,
-            starts=plant.instances.starts,
-            same_segmenter=same_segmenter,
-            cache=plant.opened.cache,
-        )
+        return fit_surfaces(regions, ids, cameras, starts=starts, same_segmenter=same_segmenter, cache=cache)
 
 
 def _find_missing(plant: Plant, result: Result) -> Finding | None:

@@ -9,9 +9,10 @@ before each round, what a label is, and after it, whether the new weights stay.
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +30,6 @@ from mvseg.pipeline.find_in_photos import run_near
 from mvseg.pipeline.finish import complete_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.results.result import Learned
-from mvseg.system.atomic import write_whole
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
@@ -106,16 +106,16 @@ def _is_smaller(plant: Plant) -> bool:
 
 def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Plant:
     opened = plant.opened
-    path = cache.learned(_describe(plant, labels))
     with timed("learn"):  # a round begins, also where it was learned before
-        if not path.is_file():
-            content = _fine_tune(plant, labels)
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, lambda partial: partial.write_bytes(content))
+        path = cache.get(_describe(plant, labels), partial(_fine_tune, plant, labels), _find, kind="learned-")
     config = replace(opened.config, detect=replace(opened.config.detect, weights=str(path)))
     taught = run_near(replace(plant, opened=replace(opened, config=config)), cache=cache)
     learned = Learned(weights=_at_size(path, taught.image_size))
     return replace(taught, opened=opened, learned=learned, colors=None, findings=())
+
+
+def _find(path: Path) -> Path | None:
+    return path if path.is_file() else None
 
 
 def _at_size(path: Path, size: int) -> bytes:
@@ -139,20 +139,18 @@ def _device() -> str:
     return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def _describe(plant: Plant, labels: ViewLabels) -> str:
+def _describe(plant: Plant, labels: ViewLabels) -> dict[str, Any]:
     shown = [each.regions for each in (labels.leaves, labels.doubtful)]
     tensors = [plant.boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
     digest = hashlib.sha256(b"".join(each.cpu().numpy().tobytes() for each in tensors))
     digest.update(np.ascontiguousarray(labels.colors).tobytes())
-    return json.dumps(
-        {
-            "weights": hash_files(Path(weights_path(plant.opened.config.detect.weights))),
-            "labels": digest.hexdigest(),
-            "photos": [describe_photo(plant.opened.photos, view) for view in range(len(plant.scene.views))],
-            "size": plant.image_size,
-            "steps": STEPS,
-            "code": code_hash(),
-            "torch": torch.__version__,
-            "device": _device(),
-        }
-    )
+    return {
+        "weights": hash_files(Path(weights_path(plant.opened.config.detect.weights))),
+        "labels": digest.hexdigest(),
+        "photos": [describe_photo(plant.opened.photos, view) for view in range(len(plant.scene.views))],
+        "size": plant.image_size,
+        "steps": STEPS,
+        "code": code_hash(),
+        "torch": torch.__version__,
+        "device": _device(),
+    }

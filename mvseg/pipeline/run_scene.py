@@ -13,8 +13,8 @@ from tempfile import TemporaryDirectory
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
-from mvseg.detection.cached_detections import CachedDetections
-from mvseg.errors import check_arguments, collect_warnings, note_warnings
+from mvseg.detection.cached_detections import CachedDetections, delete_cached
+from mvseg.errors import check_arguments, note_warnings
 from mvseg.findings.finding import keep_causes
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import pack_plant
@@ -67,13 +67,10 @@ def run_scene(
                 detections = CachedDetections(Path(cache or place))
                 plant = find_in_photos(opened, cache=detections)
                 plant = learn(plant, cache=detections, corrections=corrections)
-                detections.delete_others()
-        edited, before = apply_edits(plant, corrections), None
-        if edited.matching is not plant.matching:
-            with collect_warnings():  # of masks that nobody sees any more
-                before = shape_leaves(plant).surfaces
-        result = shape_leaves(edited, same_segmenter=before)
-        result = check_result(result, edited)
+                delete_cached(detections.folder, but=detections.used)
+        edited = apply_edits(plant, corrections)
+        before = None if edited.matching is plant.matching else shape_leaves(plant).surfaces
+        result = check_result(shape_leaves(edited, same_segmenter=before), edited)
         result = measure(result, config, corrections)
         packed = pack_plant(plant, findings_before)
     findings = keep_causes((*noticed, *result.findings))

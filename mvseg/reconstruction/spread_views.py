@@ -56,8 +56,7 @@ def _directions(cameras: Cameras) -> NDArray[np.float64]:
         target = middle + mean_axis * (centers - middle).norm(dim=1).square().mean().sqrt()
     else:
         target = nearest_point(centers, axes)
-    ways: NDArray[np.float64] = torch.nn.functional.normalize(centers - target, dim=1).numpy()
-    return ways
+    return np.asarray(torch.nn.functional.normalize(centers - target, dim=1).numpy())
 
 
 def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:

@@ -112,8 +112,7 @@ def reconstruct_instances(
     shapes, free = {}, None
     if config.seen_share > 0:
         ones = torch.ones_like(instance_ids)
-        sizes = enumerate(cameras.sizes.tolist())
-        free = {view: regions.label_map(view, ones, size) == 0 for view, size in sizes}
+        free = {view: regions.label_map(view, ones, size) == 0 for view, size in enumerate(cameras.sizes.tolist())}
     instances = instance_ids[instance_ids > 0].unique().tolist()
     for instance in progress_bar(instances, name="voxels", unit="instance"):
         members = regions.select(instance_ids == instance)
@@ -153,16 +152,14 @@ def back_project(
     views = members.view_index[members.areas > 0].unique().tolist()
     if len(views) < 2:
         return None
-    rows = [(members.view_index == view).nonzero()[:, 0].tolist() for view in views]
-    crops = [members.union(each) for each in rows]
+    crops = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
     corners = torch.tensor([crop.box[:2] for crop in crops]).to(cameras.K)
     matrices = cameras.px_from_world[views]
     silhouettes = Silhouettes(
         masks=tuple(crop.pixels for crop in crops),
         px_from_world=torch.cat((matrices[:, :2] - corners[..., None] * matrices[:, 2:], matrices[:, 2:]), 1),
     )
-    box = _bounding_box(silhouettes, config.threshold)
-    if box is None:
+    if (box := _bounding_box(silhouettes, config.threshold)) is None:
         return None
     low, high = box
     size = config.voxel_size or float(((high - low).prod() / config.voxel_budget) ** (1 / 3))

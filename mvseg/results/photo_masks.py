@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mvseg.crop import Crop
@@ -39,7 +38,6 @@ def regions_in_photos(result: Result) -> Regions:
     for row, view in enumerate(masks.view_index.tolist()):
         crop = masks.regions.placed(row)
         if result.scene.views[view].lens is not None:
-            mask = torch.from_numpy(mask_in_photo(result, row)).bool()
-            crop = Crop.of(mask) if mask.any() else Crop((0, 0, 1, 1), mask[:1, :1])
+            crop = Crop.of(mask_in_photo(result, row) > 0)
         crops.append(crop)
     return replace(replace_crops(masks, crops).regions, labels=masks.instance_ids)

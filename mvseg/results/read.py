@@ -17,7 +17,7 @@ from torch import Tensor
 
 from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
-from mvseg.crop import Box, Crop
+from mvseg.crop import Crop
 from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, check_arguments, faults_of, warn
 from mvseg.findings.finding import Finding, Values
@@ -239,37 +239,31 @@ def _as_tensor(numbers: object, *shape: int) -> Tensor:
 
 
 def _table_of(content: _Instances, scene: Scene) -> Masks:
-    view_of = {image.id: view for view, image in enumerate(content.images)}
-    views, boxes, crops = [], list[Box](), []
+    view_of, rows = {image.id: view for view, image in enumerate(content.images)}, list[tuple[int, Crop, int]]()
     for row, each in enumerate(content.annotations):
         with faults_of(f"annotations[{row}]"):
             if each.image_id not in view_of:
                 raise InputError(f"there is no image {each.image_id}")
-            views.append(view_of[each.image_id])
-            box, crop = _decode(each, scene, views[-1])
-            boxes.append(box)
-            crops.append(torch.from_numpy(crop.copy()).flatten())
-    rows = content.annotations
-    labels = [row if each.source_label is None else each.source_label for row, each in enumerate(rows, start=1)]
-    masks = Masks.of(
-        stack_regions(views, boxes, crops, labels=labels, num_views=len(content.images)),
-        torch.tensor([each.instance_id for each in rows], dtype=torch.int64),
-        torch.tensor([each.match_score for each in rows], dtype=torch.float32),
-        detection_scores=torch.tensor([each.score for each in rows], dtype=torch.float32),
-        classes=torch.tensor([each.mask_class for each in rows], dtype=torch.int64),
+            view, label = view_of[each.image_id], row + 1 if each.source_label is None else each.source_label
+            rows.append((view, _decode(each, scene, view), label))
+    masks, read = content.annotations, Masks.of(stack_regions(rows, len(content.images)))
+    return replace(
+        read,
+        instance_ids=torch.tensor([each.instance_id for each in masks], dtype=torch.int64),
+        match_scores=torch.tensor([each.match_score for each in masks], dtype=torch.float32),
+        detection_scores=torch.tensor([each.score for each in masks], dtype=torch.float32),
+        classes=torch.tensor([each.mask_class for each in masks], dtype=torch.int64),
+        origin=torch.tensor([each.origin for each in masks], dtype=torch.int64),
     )
-    return replace(masks, origin=torch.tensor([int(each.origin) for each in rows]).long())
 
 
-def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:
+def _decode(mask: _Mask, scene: Scene, view: int) -> Crop:
     (width, height), lens = scene.cameras.sizes[view].tolist(), scene.views[view].lens
     rle = mask.undistorted or mask.segmentation
     if lens is None or mask.undistorted is not None:
         return decode_crop(rle.counts, width, height)
-    found = decode_rle(rle.counts, width, height).astype(np.uint8)
-    pixels = torch.from_numpy(undistort(found, lens, scene.cameras.K[view].numpy())).bool()
-    crop = Crop.of(pixels) if pixels.any() else Crop((0, 0, 1, 1), pixels[:1, :1])
-    return crop.box, crop.pixels.numpy()
+    whole = decode_rle(rle.counts, width, height).astype(np.uint8)
+    return Crop.of(undistort(whole, lens, scene.cameras.K[view].numpy()) > 0)
 
 
 def _report_of(run: RunRecord) -> MatchReport:

@@ -48,8 +48,7 @@ class Instances:
         def rename(values: Mapping[int, Any] | None) -> Any:
             return None if values is None else {numbers[instance]: each for instance, each in values.items()}
 
-        columns = (rename(each) for each in (self.probabilities, self.starts, self.surfaces, self.voxels))
-        return Instances(*columns)
+        return Instances(*map(rename, (self.probabilities, self.starts, self.surfaces, self.voxels)))
 
 
 @dataclass(frozen=True)

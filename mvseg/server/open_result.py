@@ -142,7 +142,7 @@ class OpenResult:
                 ids = zip(name_regions(saved.regions), saved.masks.instance_ids.tolist(), strict=True)
                 self._numbers.update({name: number for name, number in ids if number > 0})
                 return replace(saved, scene=self.scene, photos=self.photos)
-        nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(self.scene.views)))
+        nothing = Masks.of(stack_regions([], len(self.scene.views)))
         return Result(self.scene, Matching(nothing, MatchReport("none")))
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
@@ -229,8 +229,7 @@ class OpenResult:
 
     def _fit_before(self, plant: Plant) -> Mapping[int, LeafSurface] | None:
         if self._before is None or self._before[0] is not plant:
-            with collect_warnings():
-                self._before = plant, shape_leaves(plant).surfaces
+            self._before = plant, shape_leaves(plant).surfaces
         return self._before[1]
 
     def _before_edits(self) -> bytes | None:

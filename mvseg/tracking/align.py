@@ -63,7 +63,7 @@ def list_poses(pair: Pair) -> Poses:
     each refined; where up is not known, of any rotation. Without leaves on one date, only "as it stood"."""
     refined = [align_at(pair, np.eye(4))]
     if pair.fewer:
-        asked = [draw_poses(replace(pair, first=pair.first.take(row), second=pair.second.take(column)))
+        asked = [draw_poses(replace(pair, first=pair.first.select(row), second=pair.second.select(column)))
                  for row, column in np.argwhere(pair.link_costs < 0)[..., None]]  # fmt: skip
         looked_at = np.concatenate([np.eye(4)[None], *asked])
         poses = np.concatenate([looked_at, draw_poses(pair)])

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvseg.arrays import Floats
+from mvseg.table import Table
 from mvseg.tracking.dates import PlantOnDate, SeenLeaf
 from mvseg.tracking.numbers import ALIGN, COSTS, OBSERVATIONS
 
 
 @dataclass(frozen=True, eq=False)
-class DateLeaves:
+class DateLeaves(Table):
     """N leaves with a shape, as arrays, in one frame.
 
     Attributes:
@@ -38,9 +39,6 @@ class DateLeaves:
     is_oriented: np.ndarray
     is_surface: np.ndarray
 
-    def __len__(self) -> int:
-        return len(self.index)
-
     @property
     def bases(self) -> Floats:
         return self.midribs[:, 0]
@@ -50,9 +48,6 @@ class DateLeaves:
         """(N, 3) unit directions from base to tip."""
         ahead = self.midribs[:, -1] - self.midribs[:, 0]
         return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
-
-    def take(self, rows: np.ndarray) -> DateLeaves:
-        return DateLeaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def moved(self, pose: Floats) -> DateLeaves:
         """In another frame, by its pose (4, 4)."""

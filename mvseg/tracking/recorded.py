@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -42,8 +41,7 @@ class PlantResults(BaseModel, frozen=True):
         return name_apart([read_date(folder, time, pictures=pictures) for folder, time in dated])
 
 
-@dataclass(frozen=True)
-class RecordedTracks:
+class RecordedTracks(BaseModel, frozen=True):
     """The run of `mvseg track` that made a folder.
 
     Attributes:
@@ -51,13 +49,7 @@ class RecordedTracks:
         corrections: the file of links that were given, if it is still there.
     """
 
-    folder: Path
-    plants: tuple[PlantResults, ...]
-    pots: Pots
-    corrections: Path | None
-
-
-class _Config(BaseModel):
+    folder: Path = Path()
     plants: tuple[PlantResults, ...] = ()
     pots: Pots = "auto"
     corrections: Path | None = None
@@ -69,7 +61,7 @@ class _Output(BaseModel):
 
 
 class _Run(BaseModel):
-    config: _Config
+    config: RecordedTracks
     output: _Output | None = None
 
 
@@ -105,4 +97,4 @@ def read_recorded_tracks(folder: Path) -> RecordedTracks:
     config = record.config
     plants = tuple(each.model_copy(update={"results": tuple(map(find, each.results))}) for each in config.plants)
     corrections = config.corrections if config.corrections is not None and config.corrections.is_file() else None
-    return RecordedTracks(folder, plants, config.pots, corrections)
+    return config.model_copy(update={"folder": folder, "plants": plants, "corrections": corrections})

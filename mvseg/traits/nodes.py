@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvseg.arrays import Floats, Ints
 from mvseg.reconstruction.stem.leaf_bases import LeafBases, project_bases
 from mvseg.reconstruction.stem.stem_axis import StemAxis
+from mvseg.table import Table
 from mvseg.traits.leaf import VAGUE_DEG, Measurement, missing, wrap_azimuth
 
 ARCH_SD_DEG = 6.0  # fitted: python benchmarks/stems.py --cache DIR; of the angle by which petioles bend
@@ -104,7 +105,7 @@ class Stem:
 
 
 @dataclass(frozen=True, eq=False)
-class _Places:
+class _Places(Table):
     """N leaves along a stem, upwards.
 
     Attributes:
@@ -215,7 +216,7 @@ def _place_leaves(axis: StemAxis, bases: LeafBases, frame: Floats | None) -> _Pl
     )
     order = np.lexsort((bases.ids, along))
     order = order[(along[order] > 0) & (along[order] < reach[-1])]  # others would join it where the curve is cut
-    return _Places(**{field.name: getattr(leaves, field.name)[order] for field in fields(_Places)})
+    return leaves.select(order)
 
 
 def _reference(tangents: Floats, frame: Floats | None) -> Floats:

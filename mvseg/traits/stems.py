@@ -287,7 +287,7 @@ def _of_path(
     nearer = choose_ends(ends, others, line)
     nearer = nearer.select(~np.isin(nearer.ids, traced.ids))
     _, gap, _ = project_bases(nearer, axis.extend())
-    bases = LeafBases.join(traced, nearer.select(gap < AXES.near * np.median(ends.lengths)))
+    bases = LeafBases.concatenate((traced, nearer.select(gap < AXES.near * np.median(ends.lengths))))
     _, _, along = project_bases(bases, axis.extend())
     num_places = 1 + int((np.diff(np.sort(along)) > 2 * path.cell).sum()) if len(along) else 0
     if len(bases) < LEAF_SHARE * len(surfaces) or num_places < AXES.least_leaves:

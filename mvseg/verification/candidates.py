@@ -52,8 +52,7 @@ class Candidates:
 
     def match_scores(self, rows: Ints, of: Ints) -> Floats:
         """(N,) match score of N masks, by their rows, for a candidate each; NaN where the matcher gave none."""
-        scores: Floats = np.append(self.matched, np.full((len(self.matched), 1), np.nan), 1)[rows, of]
-        return scores
+        return np.asarray(np.append(self.matched, np.full((len(self.matched), 1), np.nan), 1)[rows, of])
 
     @cached_property
     def has_surface(self) -> Bools:

@@ -126,20 +126,11 @@ def choose(
     is_other_class, colors = ~same_class(candidates, table), MaskColors.of(drawn)
     hides, steps, is_leaf, q = np.zeros(len(candidates), bool), list[Step](), rows.is_leaf, rows.shows
     for _ in range(CHOICE.rounds):
-        evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(Pairs(candidates, evidence, scores), fitted), CHOICE.digits)
+        pairs = Pairs(candidates, see(drawn, len(table), hides), scores)
+        q = np.round(show_chances(pairs, fitted), CHOICE.digits)
         q[is_other_class] = 0
         q = rows.add_to(q, is_made)
-        steps = rank(
-            candidates,
-            q,
-            rows.certain & is_made,
-            drawn=drawn,
-            colors=colors,
-            share=evidence.share,
-            scores=scores,
-            fitted=fitted,
-        )
+        steps = rank(pairs, q, rows.certain & is_made, drawn=drawn, colors=colors, fitted=fitted)
         chances = np.array([each.chance for each in steps])
         least = least_chance(chances) if min_probability is None else min_probability
         is_leaf = rows.is_leaf.copy()
@@ -188,22 +179,15 @@ def same_class(candidates: Candidates, table: Masks) -> Bools:
 
 
 def rank(
-    candidates: Candidates,
-    q: Floats,
-    certain: Bools,
-    *,
-    drawn: Sequence[Drawn],
-    colors: MaskColors | None,
-    share: Floats,
-    scores: Floats,
-    fitted: LeafScores,
+    pairs: Pairs, q: Floats, certain: Bools, *, drawn: Sequence[Drawn], colors: MaskColors | None, fitted: LeafScores
 ) -> list[Step]:
     """Rank candidates by P. Each one takes its masks and removes overlapping masks from the rest."""
     view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
     for number, each in enumerate(drawn):
         view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
+    candidates, share, sure = pairs.candidates, pairs.evidence.share, log_odds(pairs.scores)
     is_open, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
-    sure, rows_of_views, is_first = log_odds(scores), [each.rows for each in drawn], certain.any(0)
+    rows_of_views, is_first = [each.rows for each in drawn], certain.any(0)
     while is_open.any():
         best, row = best_masks(free, rows_of_views)
         met = Met(candidates, best, row, sure, share)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from mvseg.arrays import Bools, Ints
-from mvseg.errors import collect_warnings, warn
+from mvseg.errors import warn
 from mvseg.findings.finding import Finding
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
@@ -89,8 +89,7 @@ class Edited:
     @property
     def is_held(self) -> Tensor:
         """(D',) bool: an edit is about the mask, or it follows from one."""
-        masks = self.masks
-        return masks.is_corrected | masks.is_linked | (masks.origin == Origin.OTHER_VIEWS)
+        return self.masks.is_edited | (self.masks.origin == Origin.OTHER_VIEWS)
 
     @property
     def is_certain(self) -> Tensor:
@@ -133,10 +132,9 @@ class Judges:
 
 
 def fit_roughly(masks: Masks, cameras: Cameras, cache: Cache | None) -> dict[int, LeafSurface]:
-    """{instance id: surface}, fitted to few views. Nothing is warned of: the final fits warn."""
-    with collect_warnings():
-        ids = masks.instance_ids
-        return fit_surfaces(masks.regions, ids, cameras, most_views=EVIDENCE.rough_views, is_rough=True, cache=cache)
+    """{instance id: surface}, fitted to few views."""
+    regions, ids = masks.regions, masks.instance_ids
+    return fit_surfaces(regions, ids, cameras, most_views=EVIDENCE.rough_views, is_rough=True, cache=cache)
 
 
 def find_again(matched: Masks, judges: Judges, config: MatchConfig) -> Masks | None:

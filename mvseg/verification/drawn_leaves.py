@@ -60,7 +60,7 @@ def follow_drawn(
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
     drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
     leaves = [_DrawnLeaf(masks, leaf, cameras, (), cache) for leaf in drawn]
-    followed = [each.leaf for each in leaves if each.views_without or (each.is_own & ~each.is_certain).any()]
+    followed = [each.leaf for each in leaves if each.views_without or (each.is_own & ~masks.is_edited).any()]
     if not followed or median_parallax(masks, cameras) < EVIDENCE.least_parallax:
         return masks
     colors = colors_of_leaves(masks, photos) if colors is None else colors
@@ -87,11 +87,6 @@ class _DrawnLeaf:
     def is_own(self) -> Tensor:
         return self.masks.instance_ids == self.leaf
 
-    @property
-    def is_certain(self) -> Tensor:
-        """(D,) bool: an edit is about the mask."""
-        return self.masks.is_corrected | self.masks.is_linked
-
     @cached_property
     def views_without(self) -> list[int]:
         """The views without a mask of it; none where one view alone has one."""
@@ -100,7 +95,7 @@ class _DrawnLeaf:
 
     def others(self, view: int) -> Bools:
         """(H, W) masks of other leaves, and masks without one that edits are about."""
-        is_other = ~self.is_own & ((self.masks.instance_ids > 0) | self.is_certain)
+        is_other = ~self.is_own & ((self.masks.instance_ids > 0) | self.masks.is_edited)
         height, width = self.colored[view].shape
         return np.asarray(self.masks.regions.label_map(view, is_other.long(), (width, height)).numpy() > 0)
 
@@ -121,7 +116,7 @@ class _DrawnLeaf:
 def _drop_halves(drawn: _DrawnLeaf) -> _DrawnLeaf:
     """Drop masks that show half a leaf, which the user drew in two views or more: the surface that follows from the
     outlines alone contains them, and the view shows more than twice as much of it openly, all in leaf colour."""
-    masks, is_free = drawn.masks, drawn.is_own & ~drawn.is_certain
+    masks, is_free = drawn.masks, drawn.is_own & ~drawn.masks.is_edited
     views = masks.view_index[drawn.is_own & (masks.origin == Origin.CORRECTED)].unique()
     if len(views) < 2 or not is_free.any():
         return drawn
@@ -170,7 +165,7 @@ def _show(drawn: _DrawnLeaf, surface: LeafSurface) -> Masks:
     masks, leaf, parts = drawn.masks, drawn.leaf, dict[int, Crop]()
     ids = masks.instance_ids.clone()
     for view, (visible, leaf_colored) in drawn.find_open(surface).items():
-        is_free = (masks.view_index == view) & (ids < 0) & ~drawn.is_certain  # a linked one does not show the leaf
+        is_free = (masks.view_index == view) & (ids < 0) & ~masks.is_edited  # a linked one does not show the leaf
         fits = {row: masks.regions.placed(row).iou(visible) for row in is_free.nonzero()[:, 0].tolist()}
         best = max(fits, key=lambda row: fits[row], default=-1)
         if best >= 0 and fits[best] >= EVIDENCE.fits:
@@ -208,6 +203,5 @@ def _project_hull(drawn: _DrawnLeaf) -> dict[int, Bools]:
 
 
 def _with_parts(regions: Regions, parts: Mapping[int, Crop]) -> Regions:
-    boxes, pixels = [each.box for each in parts.values()], [each.pixels.flatten() for each in parts.values()]
-    new = stack_regions(list(parts), boxes, pixels, labels=[0] * len(boxes), num_views=regions.num_views)
+    new = stack_regions([(view, each, 0) for view, each in parts.items()], regions.num_views)
     return Regions.concatenate((regions, new))

@@ -48,8 +48,7 @@ class Drawn:
     @cached_property
     def common(self) -> Floats:
         """(N, K) pixels that a mask and a part share."""
-        common: Floats = (self.masks.T @ self.parts).toarray().astype(np.float64)
-        return common
+        return np.asarray((self.masks.T @ self.parts).toarray(), np.float64)
 
     @cached_property
     def is_shared(self) -> Bools:

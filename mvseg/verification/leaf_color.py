@@ -37,8 +37,7 @@ def leaf_colors(counts: Ints) -> Bools:
 def has_leaf_color(photo: Pixels, colors: Bools) -> Bools:
     """(H, W) bool, the pixels of a photo (H, W, 3) uint8 RGB whose colour is one of `leaf_colors`."""
     share = cv2.Mat(colors.astype(np.float32), wrap_channels=False)
-    has: Bools = cv2.calcBackProject([photo], CHANNELS, share, RANGES, scale=1) > 0
-    return has
+    return np.asarray(cv2.calcBackProject([photo], CHANNELS, share, RANGES, scale=1) > 0)
 
 
 def colored_shares(masks: Masks, photos: ReadPhoto, colors: Bools) -> torch.Tensor:

@@ -103,8 +103,7 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools, likely: Bools | None = No
     state = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     state[deep], state[far] = cv2.GC_FGD, cv2.GC_BGD
     leaf = cut_by_color(small, state, rounds=1).astype(np.float32)
-    snapped: Bools = cv2.resize(leaf, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5
-    return snapped & ~others
+    return np.asarray(cv2.resize(leaf, (width, height), interpolation=cv2.INTER_LINEAR) > 0.5) & ~others
 
 
 def cut_by_color(photo: NDArray[Any], state: Pixels, *, rounds: int) -> Bools:

@@ -10,13 +10,17 @@ import numpy as np
 import pytest
 import torch
 
+from mvseg.config import RunConfig
 from mvseg.corrections.apply import apply, read_stem_marks
 from mvseg.corrections.corrected import Corrected, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.findings.finding import Finding
 from mvseg.formats.lens import distort, opencv_lens, undistort
+from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.pipeline.finish import settle_edits
+from mvseg.pipeline.open_scene import Opened
+from mvseg.pipeline.plant import match_given
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.verification.choose import RejectedCandidate
@@ -270,12 +274,13 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
         at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
     )
     assert fates(corrected) == ["points at nothing"] * 3
-    left, final = settle_edits(corrected.fates, corrected.refused, (candidate, other), {}, cameras=SCENE.cameras)
-    answered = replace(corrected, fates=final)
-    assert left == (other,)
+    plant = match_given(Opened(SCENE, Photos(SCENE), RunConfig(), given=MASKS))
+    plant = replace(plant, edits=corrected.fates, refused=corrected.refused, rejected=(candidate, other))
+    settled = settle_edits(plant, {})
+    answered = replace(corrected, fates=settled.edits)
+    assert settle_edits(settled, {}).rejected == settled.rejected == (other,)
     assert fates(answered) == ["applied", "points at nothing", "applied"]
     assert len(findings_of(answered)) == 1
-    assert settle_edits(final, answered.refused, left, {}, cameras=SCENE.cameras)[0] == (other,)
 
 
 def test_links_stay_with_their_masks_when_an_instance_goes() -> None:

@@ -14,8 +14,9 @@ from mvseg.detection.cached_detections import (
     CachedDetections,
     claim_cache,
     delete_cached,
+    describe_photo,
+    encode_detections,
     read_detections,
-    write_detections,
 )
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
@@ -35,11 +36,13 @@ FOUND = {
 }
 
 
+def keep(folder: Path) -> dict[str, torch.Tensor]:
+    return CachedDetections(folder).get("a photo", lambda: encode_detections(FOUND), read_detections)
+
+
 def test_the_same_bits_come_back(tmp_path: Path) -> None:
-    path = tmp_path / "kept" / f"{'0' * 64}.safetensors"
-    write_detections(path, FOUND)
-    back = read_detections(path)
-    assert back is not None
+    keep(tmp_path)
+    back = CachedDetections(tmp_path).get("a photo", bytes, read_detections)
     assert {key: (value.dtype, value.tolist()) for key, value in back.items()} == {
         key: (value.dtype, value.tolist()) for key, value in FOUND.items()
     }
@@ -53,20 +56,19 @@ def test_what_is_broken_counts_as_absent(content: bytes | None, tmp_path: Path) 
     assert read_detections(path) is None
 
 
-def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> None:
+def test_another_photo_or_camera_has_another_name(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     names = []
 
-    def note(made_by: str = "leaf-lite") -> None:
-        names.append(CachedDetections(tmp_path / "kept").path(Photos(load_scene(folder)), 1, made_by=made_by))
+    def note() -> None:
+        names.append(str(describe_photo(Photos(load_scene(folder)), 1)))
 
     note()
-    note("another")
     edit_rig(folder, 1, distortion=[0.1, 0, 0, 0, 0])
     note()
     write_image(folder / "images" / "001.png", 255 - read_photo(load_scene(folder), 2))
     note()
-    assert len(set(names)) == 4
+    assert len(set(names)) == 3
     note()
     assert names[-1] == names[-2]
     deep = np.full((HEIGHT, WIDTH, 3), 1000, np.uint16)
@@ -74,13 +76,13 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     note()
     write_image(folder / "images" / "002.png", 4 * deep)  # 12 bits: they brighten the first one less
     note()
-    assert len(set(names)) == 6
+    assert len(set(names)) == 5
 
 
 def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     delete_cached(kept)
-    write_detections(kept / f"{'0' * 64}.safetensors", FOUND)
+    keep(kept)
     (kept / f".{'0' * 64}.safetensors.partial").touch()
     (kept / "notes.txt").touch()
     delete_cached(kept)
@@ -91,25 +93,23 @@ def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
 
 
 class TestClaim:
-    NAME = f"{'0' * 64}.safetensors"
-
     def test_only_of_the_same_scene(self, tmp_path: Path) -> None:
         kept, scene = tmp_path / "kept", tmp_path / "a"
         with claim_cache(kept, scene) as holds_some:
             assert not holds_some
-            write_detections(kept / self.NAME, FOUND)
+            keep(kept)
         with claim_cache(kept, scene) as holds_some:
             assert holds_some
         message = rf"kept: keeps what .* found in the photos of {scene}, not of .*b; expected another --out, or"
         with pytest.raises(InputError, match=message):
             claim_cache(kept, tmp_path / "b").__enter__()
-        assert (kept / self.NAME).is_file()
+        assert len(list(kept.glob("*.safetensors"))) == 1
         with claim_cache(kept, tmp_path / "b", overwrite=True):
             delete_cached(kept)
         assert list(tmp_path.iterdir()) == []
 
     def test_detections_that_say_nothing_of_their_photos_are_not_taken(self, tmp_path: Path) -> None:
-        write_detections(tmp_path / "kept" / self.NAME, FOUND)
+        keep(tmp_path / "kept")
         with pytest.raises(InputError, match="kept: holds detections, but not of which photos"):
             claim_cache(tmp_path / "kept", tmp_path).__enter__()
         with claim_cache(tmp_path / "kept", tmp_path, overwrite=True) as holds_some:
@@ -151,7 +151,7 @@ def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         monkeypatch.setattr("mvseg.detection.detect_scene.code_hash", lambda code=code: code)
         cache = CachedDetections(tmp_path / "kept")
         detect_scene(Photos(scene), DetectConfig(min_score=0.2), cache=cache)
-        cache.delete_others()
+        delete_cached(cache.folder, but=cache.used)
         names.append({path.name for path in (tmp_path / "kept").iterdir()})
     assert [len(each) for each in names] == [2, 2]
     assert not names[0] & names[1]
@@ -183,5 +183,5 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monk
     other = CachedDetections(keep)
     detect_scene(Photos(scene), DetectConfig(min_score=0.04), cache=other)
     assert len(ran) == 3 + 1 + 3
-    other.delete_others()
+    delete_cached(keep, but=other.used)
     assert len(list(keep.iterdir())) == 3  # those of other options are gone

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.evaluation.panoptic import SharedLeaf, compare_annotators, leaf_metrics
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
@@ -54,9 +55,8 @@ def random_estimate(
 
 def stack(masks: list[tuple[int, np.ndarray]], num_views: int) -> Regions:
     """Regions whose crops are whole frames."""
-    crops = [torch.from_numpy(mask).flatten() for _, mask in masks]
-    boxes = [(0, 0, mask.shape[1], mask.shape[0]) for _, mask in masks]
-    return stack_regions([view for view, _ in masks], boxes, crops, labels=[0] * len(masks), num_views=num_views)
+    rows = [(view, Crop((0, 0, mask.shape[1], mask.shape[0]), torch.from_numpy(mask)), 0) for view, mask in masks]
+    return stack_regions(rows, num_views)
 
 
 @pytest.mark.parametrize("seed", range(40))

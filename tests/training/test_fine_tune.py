@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchvision.models.detection import MaskRCNN
 from torchvision.ops import FrozenBatchNorm2d
 
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.regions import stack_regions
@@ -65,8 +66,8 @@ def photos() -> list[np.ndarray]:
 
 def label(boxes: list[tuple[int, int, int, int]], views: list[int]) -> ViewLabels:
     """Each box is a label."""
-    crops = [torch.ones((y2 - y1) * (x2 - x1), dtype=torch.bool) for x1, y1, x2, y2 in boxes]
-    masks = Masks.of(stack_regions(views, boxes, crops, labels=views, num_views=2))
+    crops = [Crop((x1, y1, x2, y2), torch.ones(y2 - y1, x2 - x1, dtype=torch.bool)) for x1, y1, x2, y2 in boxes]
+    masks = Masks.of(stack_regions([*zip(views, crops, views, strict=True)], 2))
     return ViewLabels(masks, masks.select(masks.view_index < 0), np.zeros((16,) * 3, bool))
 
 

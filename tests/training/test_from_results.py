@@ -12,6 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
+from mvseg.crop import Crop
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_labels
@@ -48,9 +49,8 @@ def result(scene: Path, tmp_path: Path) -> Path:
 
 def write_squares(folder: Path, scene: Path, *, lefts: Sequence[int], kinds: Sequence[Any] = KINDS) -> Path:
     """A result with a mask of each kind in the first photo of the shipped plant, and none in the others."""
-    boxes = [(left, 10, left + 20, 30) for left in lefts]
-    crops = [torch.ones(400, dtype=torch.bool)] * len(boxes)
-    regions = stack_regions([0] * len(boxes), boxes, crops, labels=[0] * len(boxes), num_views=9)
+    pixels = torch.ones(20, 20, dtype=torch.bool)
+    regions = stack_regions([(0, Crop((left, 10, left + 20, 30), pixels), 0) for left in lefts], 9)
     ids, scores, origins = (torch.tensor([kind[column] for kind in kinds]) for column in range(3))
     masks = replace(Masks.of(regions, ids, scores), origin=origins)
     matching = Matching(masks, MatchReport("nview", has_probabilities=True))

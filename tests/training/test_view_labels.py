@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
 from mvseg.regions import stack_regions
 from mvseg.training.view_labels import ViewLabels, are_labels, label_views
@@ -17,20 +18,15 @@ SIZE, GREEN = 60, (30, 160, 40)
 
 def squares(lefts: list[int], views: list[int], *, top: int = 10) -> Masks:
     """Squares of 10 px."""
-    boxes = [(left, top, left + 10, top + 10) for left in lefts]
-    crops = [torch.ones(100, dtype=torch.bool)] * len(boxes)
-    return Masks.of(stack_regions(views, boxes, crops, labels=[0] * len(boxes), num_views=2))
+    crops = [Crop((left, top, left + 10, top + 10), torch.ones(10, 10, dtype=torch.bool)) for left in lefts]
+    return Masks.of(stack_regions([(view, crop, 0) for view, crop in zip(views, crops, strict=True)], 2))
 
 
 def chosen(ids: list[int], scores: list[float], origins: list[Origin]) -> Masks:
     """A square for each in view 0."""
     masks = squares([10 * each for each in range(len(ids))], [0] * len(ids))
-    return replace(
-        masks,
-        instance_ids=torch.tensor(ids),
-        match_scores=torch.tensor(scores),
-        origin=torch.tensor([int(each) for each in origins]),
-    )
+    columns = dict(instance_ids=torch.tensor(ids), match_scores=torch.tensor(scores), origin=torch.tensor(origins))
+    return replace(masks, **columns)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 import pycolmap
 import torch
-from torch import Tensor
 
 from mvseg.crop import Box, Crop
 from mvseg.errors import InputError, warn
@@ -45,7 +44,7 @@ def stack_views(
     Raises:
         InputError: there are masks, and none has a pixel; or see `check_numbers`. Messages name `source`.
     """
-    rows: list[tuple[int, Box, Tensor, int]] = []
+    rows: list[tuple[int, Crop, int]] = []
     between, num_empty, num_twice = np.zeros(2, np.int64), 0, 0
     for view, content in enumerate(views):
         lens = None if scene is None else scene.views[view].lens
@@ -63,12 +62,10 @@ def stack_views(
                 num_twice += 1
             else:
                 earlier.add(key)
-                rows.append((view, box, torch.from_numpy(crop.flatten()), label))
+                rows.append((view, Crop(box, torch.from_numpy(crop)), label))
     _say_left_out(len(rows), num_empty, num_twice, source=source)
     num_views = num_views or 0 if scene is None else len(scene.views)
-    view_index, boxes, crops, labels = zip(*rows, strict=True) if rows else ((), (), (), ())
-    regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
-    regions = _without_copies(regions, source=source)
+    regions = _without_copies(stack_regions(rows, num_views), source=source)
     if between[0]:
         check_numbers(regions, between, source=source)
     if scene is not None and len(regions):  # without any, a run says so

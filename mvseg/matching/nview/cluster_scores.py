@@ -158,7 +158,7 @@ class ClusterScores:
         pixels, here = self.sweep.pixels_of[view], self.sweep.hypotheses_of[view]
         least = np.float32(-COSTS.hidden)
         best = np.full((len(members), pixels.stop - pixels.start), least)
-        cluster, hypothesis, count = self.sweep.hypotheses_of_regions(view).count(members)
+        cluster, hypothesis, count = self.sweep.hypotheses_of_regions[view].count(members)
         hypothesis += here.start
         score = self._score_hypotheses(hypothesis, count, views=pack_views(self._has_region(members)).take(cluster, 1))
         place = cluster * best.shape[1] + (self.sweep.pixel.take(hypothesis) - pixels.start)

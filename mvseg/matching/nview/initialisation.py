@@ -66,16 +66,14 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
 
 
 def _symmetric(A: Reals) -> Reals:
-    mean: Reals = (A + A.T) / np.float32(2)
-    return mean
+    return np.asarray((A + A.T) / np.float32(2))
 
 
 def _spread_pixels(sweep: PlaneSweep) -> NDArray[np.bool_]:
     most = max(1, round(EM.pixels * min(1, SWEEP.plenty / sweep.num_views)))
     counts = np.bincount(sweep.pixel_region, minlength=len(sweep.view_index))
     rank = np.arange(len(sweep.pixel_region)) - np.searchsorted(sweep.pixel_region, sweep.pixel_region)
-    is_used: NDArray[np.bool_] = rank % np.maximum(1, -(-counts // most))[sweep.pixel_region] == 0
-    return is_used
+    return np.asarray(rank % np.maximum(1, -(-counts // most))[sweep.pixel_region] == 0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ device, labels and everything from the sweep on are NumPy (which compares and lo
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
 
@@ -94,7 +94,6 @@ class PlaneSweep:
     pixel_region: Ints
     view_index: Ints
     num_views: int
-    _hypotheses_of_regions: dict[int, HypothesesOfRegions] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def regions_of(self) -> list[slice]:
@@ -125,12 +124,10 @@ class PlaneSweep:
         """(W, I), which views show no region there, see `pack_views`."""
         return pack_views(self.labels == EMPTY)
 
-    def hypotheses_of_regions(self, view: int) -> HypothesesOfRegions:
-        """Hypotheses on rays of one view by the regions that they name; cached for the next call."""
-        if view not in self._hypotheses_of_regions:
-            labels = self.labels[self.hypotheses_of[view]]
-            self._hypotheses_of_regions[view] = index_hypotheses(labels, len(self.view_index))
-        return self._hypotheses_of_regions[view]
+    @cached_property
+    def hypotheses_of_regions(self) -> list[HypothesesOfRegions]:
+        """Hypotheses on rays of each view by the regions that they name."""
+        return [index_hypotheses(self.labels[here], len(self.view_index)) for here in self.hypotheses_of]
 
 
 def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1) -> PlaneSweep:
@@ -302,8 +299,7 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
     column = torch.add(base[:, :1], inverse, alpha=offset[0]).mul_(scale).add_(1).clamp_(0, width - 1).int()
     row = torch.add(base[:, 1:2], inverse, alpha=offset[1]).mul_(scale).add_(1).clamp_(0, height - 1).int()
     place = row.mul_(width).add_(column).masked_fill_(is_behind, 0)  # the frame of the map is OUTSIDE
-    found: NDArray[np.integer] = labels.numpy().ravel().take(place.numpy().ravel())  # torch's look-up is slower
-    return found
+    return np.asarray(labels.numpy().ravel().take(place.numpy().ravel()))  # torch's look-up is slower
 
 
 def _join_equal(pixel: Ints, labels: NDArray[np.integer]) -> tuple[Ints, NDArray[np.integer]]:

@@ -29,9 +29,8 @@ def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[C
     they are worth nearly as much: then the masks are sound, and the weights decide better about slivers that few views
     show. The scores are of three views or more; `more_starts` are partitions to start from as well.
     """
-    refined = []
-    for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
-        refined.append(refine_clusters(scores, refine_clusters(scores, start), join_fragments=True))
+    starts = *initial_partitions(scores.sweep, scores.graph), *more_starts
+    refined = [refine_clusters(scores, refine_clusters(scores, start), join_fragments=True) for start in starts]
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
     if max(values) - values[0] > (1 - SEARCH.as_good) * abs(max(values)):

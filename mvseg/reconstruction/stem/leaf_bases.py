@@ -7,7 +7,7 @@ the curve near which most of these rays pass. The base of a leaf is the end near
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +17,11 @@ from mvseg.reconstruction.numbers import AXES
 from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.reconstruction.surface.leaf_patch import patch_basis
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.table import Table
 
 
 @dataclass(frozen=True, eq=False)
-class LeafBases:
+class LeafBases(Table):
     """Bases of N leaves.
 
     Attributes:
@@ -40,18 +41,6 @@ class LeafBases:
     lengths: Floats
     point_sd: Floats
     angle_sd: Floats
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def select(self, keep: NDArray) -> LeafBases:
-        """Select bases at an index (M,), or where `keep` (N,) is true."""
-        return LeafBases(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
-
-    @staticmethod
-    def join(first: LeafBases, second: LeafBases) -> LeafBases:
-        names = [field.name for field in fields(LeafBases)]
-        return LeafBases(**{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names})
 
 
 def find_ends(surfaces: Mapping[int, LeafSurface]) -> tuple[LeafBases, LeafBases]:
@@ -238,7 +227,7 @@ def _fit_axis(
 def choose_ends(first: LeafBases, second: LeafBases, curve: Floats) -> LeafBases:
     """Choose the end of each leaf that is nearer to a curve (P, 3)."""
     gaps = [np.linalg.norm(each.points[:, None] - curve, axis=2).min(1) for each in (first, second)]
-    return LeafBases.join(first, second).select(np.arange(len(first)) + len(first) * (gaps[1] < gaps[0]))
+    return LeafBases.concatenate((first, second)).select(np.arange(len(first)) + len(first) * (gaps[1] < gaps[0]))
 
 
 def project_bases(bases: LeafBases, curve: Floats) -> tuple[Floats, Floats, Floats]:

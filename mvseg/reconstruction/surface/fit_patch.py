@@ -126,7 +126,7 @@ class _Equations:
 
     def of_leaf(self, leaf: int) -> _Equations:
         keep = self.distances.leaf == leaf
-        return _Equations(self.distances.of_leaf(leaf), self.px[keep], self.weight[keep], self.noise[[leaf]])
+        return _Equations(self.distances.select(keep), self.px[keep], self.weight[keep], self.noise[[leaf]])
 
 
 def _covariance(matrix: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
@@ -206,8 +206,7 @@ def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
     ordered = np.sort(np.append(values, np.nan)[places], 1)  # what is not a number comes last
     if not ordered.size:
         return np.full(num_views, np.nan)
-    medians: Floats = (ordered[view, np.maximum(counts - 1, 0) // 2] + ordered[view, counts // 2]) / 2
-    return medians
+    return np.asarray((ordered[view, np.maximum(counts - 1, 0) // 2] + ordered[view, counts // 2]) / 2)
 
 
 def _normal_matrices(coefficients: Floats, equations: _Equations, size: PatchSize) -> tuple[Floats, Floats]:
@@ -236,5 +235,4 @@ def _rms_per_view(equations: _Equations, num_views: int) -> Floats:
     distances = equations.distances
     squares = np.bincount(distances.stack, equations.weight * distances.px**2, num_views)
     with np.errstate(invalid="ignore"):
-        rms: Floats = np.sqrt(squares / np.bincount(distances.stack, equations.weight, num_views))
-    return rms
+        return np.asarray(np.sqrt(squares / np.bincount(distances.stack, equations.weight, num_views)))

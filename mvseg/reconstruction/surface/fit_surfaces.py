@@ -26,10 +26,7 @@ from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stac
 from mvseg.reconstruction.surface.occupancy import occupy_surface, unshown_share
 from mvseg.reconstruction.surface.orientation import orient_surfaces
 from mvseg.reconstruction.surface.patch_image import (
-    crop_ious,
-    draw_patch,
     hiding_pixels,
-    project_points,
     select_hiding,
     view_ious,
 )
@@ -271,14 +268,12 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats) -> LeafSurface
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "shape_unknown", "its masks do not tell its shape")
     points = patch_grid(*FIT.grid).points(fit.coefficients)
-    grown = np.nan_to_num(fit.offsets_px)
-    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=grown, is_blurred=False) >= 0.5
     surface = LeafSurface(
         coefficients=torch.from_numpy(fit.coefficients),
         covariance=torch.from_numpy(fit.covariance),
         views=torch.from_numpy(masks.views),
         residual_px=torch.from_numpy(fit.residual_px * masks.pixel_size),
-        iou=torch.from_numpy(crop_ious(masks, drawn)),
+        iou=torch.from_numpy(view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))),
         is_oriented=False,
         quality=Quality(),
         offsets_px=torch.from_numpy(offsets),

@@ -192,10 +192,8 @@ def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
     # Where the side vector vanishes (pointed ends) the mean one stands in.
     side = side + PRIOR.pointed * coefficients[..., SIDE, :].mean(-2, keepdims=True)
     across = unit_vectors(side - (side * along).sum(-1, keepdims=True) * along)
-    (ax, ay, az), (bx, by, bz) = np.moveaxis(along, -1, 0), np.moveaxis(across, -1, 0)
-    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)  # np.cross is slow on few
     ends = np.cumsum(_frame_counts())[:-1]
-    return list(zip(*(np.split(each, ends, -2) for each in (along, across, normal)), strict=True))
+    return list(zip(*(np.split(each, ends, -2) for each in (along, across, cross(along, across))), strict=True))
 
 
 @cache
@@ -206,6 +204,12 @@ def _frame_rows() -> tuple[Floats, Floats]:
     zeros = np.zeros_like(middle)
     ahead = patch_basis(middle + PRIOR.step, zeros) - patch_basis(middle - PRIOR.step, zeros)
     return ahead, spline_basis(middle, COUNTS[1])
+
+
+def cross(first: Floats, second: Floats) -> Floats:
+    """(..., 3) cross products; `np.cross` is slow on few."""
+    (ax, ay, az), (bx, by, bz) = np.moveaxis(first, -1, 0), np.moveaxis(second, -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
 
 
 def unit_vectors(vectors: Floats) -> Floats:

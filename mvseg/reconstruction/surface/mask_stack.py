@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,13 +18,14 @@ from skimage.measure import find_contours
 
 from mvseg.arrays import Floats
 from mvseg.reconstruction.numbers import STACK
+from mvseg.table import Table
 
 FRAME = -1  # definition: what lies outside the image has this label
 Labels = NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
-class MaskStack:
+class MaskStack(Table):
     """The masks of one leaf in its S views, as crops (S, H, W) of one size; or of several leaves, see `join_stacks`.
 
     Attributes:
@@ -54,9 +56,6 @@ class MaskStack:
     edge_stack: NDArray[np.int64]
     axes: Floats
 
-    def __len__(self) -> int:
-        return len(self.views)
-
     @cached_property
     def depth_px(self) -> NDArray[np.float32]:
         """(S, H, W) how deep in the mask a pixel lies: its centre's distance from the edge, negative outside."""
@@ -76,8 +75,7 @@ class MaskStack:
 
     def look_up(self, values: NDArray, stack: NDArray, px: Floats) -> NDArray:
         """Values (S, H, W) of the pixels that the positions (P, 2) lie in; outside of a crop those of its border."""
-        found: NDArray = values.ravel().take(self.place_of(stack, px))
-        return found
+        return np.asarray(values.ravel().take(self.place_of(stack, px)))
 
     def place_of(self, stack: NDArray, px: Floats) -> NDArray[np.int64]:
         """(P,) where `look_up` looks in flat values."""
@@ -85,8 +83,7 @@ class MaskStack:
         last = (self.sides - 1).T
         column = np.minimum(np.maximum(px[:, 0], 0), last[0].take(stack)).astype(np.int64)
         row = np.minimum(np.maximum(px[:, 1], 0), last[1].take(stack)).astype(np.int64)
-        place: NDArray[np.int64] = (stack * rows + row) * columns + column
-        return place
+        return np.asarray((stack * rows + row) * columns + column)
 
     def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.floating]:
         """(P, T) of values (S, H, W) at positions (P, T, 2), bilinear between pixel centres."""
@@ -103,22 +100,18 @@ class MaskStack:
         bottom = flat[columns:].take(first) * left + flat[columns + 1 :].take(first) * x
         return top * above + bottom * y
 
-    def select(self, keep: NDArray[np.bool_]) -> MaskStack:
-        """Only the views (S,) that are to be kept."""
-        edges = keep[self.edge_stack]
-        return replace(
-            self,
-            leaf=self.leaf[keep],
-            sides=self.sides[keep],
-            views=self.views[keep],
-            px_from_world=self.px_from_world[keep],
-            blurred=self.blurred[keep],
-            inside=self.inside[keep],
-            others=self.others[keep],
-            edge_px=self.edge_px[edges],
-            edge_normals=self.edge_normals[edges],
-            edge_stack=(np.cumsum(keep) - 1)[self.edge_stack[edges]],
-        )
+    @property
+    def columns(self) -> dict[str, Any]:
+        """Columns with a row for each view."""
+        beside = "edge_px", "edge_normals", "edge_stack", "axes"
+        return {name: each for name, each in super().columns.items() if name not in beside}
+
+    def _pick_rows(self, index: NDArray) -> dict[str, Any]:
+        place = np.full(len(self), -1)
+        place[index] = np.arange(len(index))
+        edges = (stack := place[self.edge_stack]) >= 0
+        of_edges = {"edge_px": self.edge_px[edges], "edge_normals": self.edge_normals[edges]}
+        return super()._pick_rows(index) | of_edges | {"edge_stack": stack[edges]}
 
     def turn_world(self, axes: Floats) -> MaskStack:
         """The same masks for world coordinates along orthonormal axes (3, 3), in rows."""

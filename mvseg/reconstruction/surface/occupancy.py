@@ -95,8 +95,7 @@ def _log_odds(masks: MaskStack, inside: NDArray[np.bool_], points: Floats, norma
     rays = centres - cameras
     lengths = np.linalg.norm(rays, axis=-1) * np.maximum(np.linalg.norm(normals, axis=-1), 1e-300)
     cosines = np.abs((rays * normals).sum(-1)) / lengths
-    odds: Floats = np.log(1 / OCCUPANCY.vote_error - 1) * cosines * _votes(masks, inside, centres)
-    return odds
+    return np.asarray(np.log(1 / OCCUPANCY.vote_error - 1) * cosines * _votes(masks, inside, centres))
 
 
 def _cover(masks: MaskStack, points: Floats, is_leaf: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -19,20 +19,17 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
 
-def reversal_matrix() -> Floats:
-    """(26, 26): of coefficients to those of the same surface from its other end (u -> 1 - u, v -> -v). Normals stay."""
-    starts = np.cumsum((0, *COUNTS))
-    order = np.concatenate([np.arange(first, last)[::-1] for first, last in pairwise(starts)])
-    matrix = np.eye(NUM_COEFFICIENTS)[order]
-    matrix[SIDE] *= -1
-    return matrix
-
-
 def mirror_matrix() -> Floats:
     """(26, 26): of coefficients to those of the same surface with its edges exchanged (v -> -v). Normals turn over."""
     matrix = np.eye(NUM_COEFFICIENTS)
     matrix[SIDE] *= -1
     return matrix
+
+
+def reversal_matrix() -> Floats:
+    """(26, 26): of coefficients to those of the same surface from its other end (u -> 1 - u, v -> -v). Normals stay."""
+    starts = np.cumsum((0, *COUNTS))
+    return mirror_matrix()[np.concatenate([np.arange(first, last)[::-1] for first, last in pairwise(starts)])]
 
 
 def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[int, LeafSurface]:

@@ -8,7 +8,7 @@ only has to cover the mask, and a negative distance does not count.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 
@@ -26,10 +26,11 @@ from mvseg.reconstruction.surface.patch_image import (
     grid_orientations,
     project_points,
 )
+from mvseg.table import Table
 
 
 @dataclass(frozen=True, eq=False)
-class OutlineSamples:
+class OutlineSamples(Table):
     """K samples on the outline of a projected patch.
 
     Attributes:
@@ -46,25 +47,16 @@ class OutlineSamples:
     place: NDArray[np.int64]
     depth: Floats
 
-    def select(self, keep: NDArray) -> OutlineSamples:
-        places = np.flatnonzero(keep) if keep.dtype == bool else keep
-        return OutlineSamples(*(getattr(self, field.name).take(places, 0) for field in fields(self)))
-
 
 def outline_samples(
     masks: MaskStack, grid: PatchGrid, projection: Projection
 ) -> tuple[OutlineSamples, NDArray[np.uint8]]:
     """The visible outline of a patch in every view: its rim, and the folds that stand out against the background. Also
     (S, H, W) uint8, above 0 where the patch covers a pixel of `masks`."""
-    samples = _concatenate(_rim_samples(grid, projection), _fold_samples(grid, projection))
+    samples = OutlineSamples.concatenate((_rim_samples(grid, projection), _fold_samples(grid, projection)))
     outside = samples.px + OUTLINE.outside_px * samples.normals
     covered = cover_crops(masks, projection)
     return samples.select(masks.look_up(covered, samples.stack, outside) == 0), covered
-
-
-def _concatenate(first: OutlineSamples, second: OutlineSamples) -> OutlineSamples:
-    names = [field.name for field in fields(first)]
-    return OutlineSamples(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
 
 
 def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
@@ -102,8 +94,7 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     px, depth, is_front = projection.px.reshape(-1, 2), projection.depth.ravel(), grid_orientations(projection.px) > 0
 
     def middles(corner: NDArray) -> Floats:
-        quad: Floats = px[corner + columns + 1] + px[corner] + px[corner + columns] + px[corner + 1]
-        return quad / 4
+        return np.asarray(px[corner + columns + 1] + px[corner] + px[corner + columns] + px[corner + 1]) / 4
 
     parts = []
     # Edges from row to row, between quads side by side, and from column to column.
@@ -125,7 +116,7 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
                 depth=depth[a],
             )
         )
-    return _concatenate(*parts)
+    return OutlineSamples.concatenate(parts)
 
 
 def _outwards(tangent: Floats, away: Floats) -> Floats:
@@ -137,7 +128,7 @@ def _outwards(tangent: Floats, away: Floats) -> Floats:
 
 
 @dataclass(frozen=True, eq=False)
-class Distances:
+class Distances(Table):
     """N signed distances and their dependencies.
 
     Attributes:
@@ -157,12 +148,6 @@ class Distances:
     grid: PatchGrid
     leaf: NDArray[np.int64]
     num_leaves: int
-
-    def of_leaf(self, leaf: int) -> Distances:
-        """Samples of one patch."""
-        keep = self.leaf == leaf
-        names = "stack", "px", "place", "gradient", "weight", "leaf"
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
 
     @property
     def jacobian(self) -> Floats:
@@ -227,7 +212,7 @@ def outline_distances(
     own, toward, back = own[keep], toward[keep], back[keep]
     forth = samples.select(counts)
     reverse = samples.select(own)
-    both = _concatenate(forth, reverse)
+    both = OutlineSamples.concatenate((forth, reverse))
     normals = np.concatenate([forth.normals, toward])
     return Distances(
         stack=both.stack,
@@ -243,8 +228,7 @@ def outline_distances(
 
 def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) -> Floats:
     rows = px_from_world[:, :2, :3] - samples.px[:, :, None] * px_from_world[:, 2:, :3]
-    across: Floats = normals[:, :1] * rows[:, 0] + normals[:, 1:] * rows[:, 1]
-    return across / samples.depth[:, None]
+    return np.asarray(normals[:, :1] * rows[:, 0] + normals[:, 1:] * rows[:, 1]) / samples.depth[:, None]
 
 
 def search_edges(
@@ -325,8 +309,7 @@ def nearest_samples(
 
 def _products(first: Floats, second: Floats) -> Floats:
     """(S, A, B) of vectors (S, A, 2) and (S, B, 2): matrices of other sizes would be multiplied in another order."""
-    products: Floats = first[:, :, None, 0] * second[:, None, :, 0] + first[:, :, None, 1] * second[:, None, :, 1]
-    return products
+    return np.asarray(first[:, :, None, 0] * second[:, None, :, 0] + first[:, :, None, 1] * second[:, None, :, 1])
 
 
 def _take(values: NDArray, places: NDArray) -> NDArray:

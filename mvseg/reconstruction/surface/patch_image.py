@@ -46,7 +46,7 @@ def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
     return covered
 
 
-def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None) -> Floats:
+def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats) -> Floats:
     """(S,) IoU of grid points (rows, columns, 3) of a patch and the mask in each view, where nothing else hides it.
     With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is."""
     shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, is_blurred=False)
@@ -59,8 +59,7 @@ def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats |
     inside = masks.inside if offsets is None else masks.depth_px > offsets[:, None, None]
     covered = covered & (masks.others == 0)
     common, either = (np.array(list(map(np.count_nonzero, each))) for each in (covered & inside, covered | inside))
-    ious: Floats = common / np.maximum(either, 1)
-    return ious
+    return np.asarray(common / np.maximum(either, 1))
 
 
 def draw_patch(
@@ -90,8 +89,7 @@ def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
     is_away = canvas == 0 if px > 0 else canvas > 0
     # Distances are to pixel centres: the border is half a pixel nearer.
     is_near = cv2.distanceTransform(is_away.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) < abs(px) + 0.5
-    grown: NDArray[np.uint8] = np.where(is_near if px > 0 else is_away & ~is_near, np.uint8(255), np.uint8(0))
-    return grown
+    return np.asarray(np.where(is_near if px > 0 else is_away & ~is_near, np.uint8(255), np.uint8(0)))
 
 
 def fill_grids(canvases: Iterable[NDArray[np.uint8]], px: Floats) -> None:
@@ -122,8 +120,7 @@ def grid_orientations(px: Floats) -> Floats:
     """(..., rows - 1, columns - 1) twice the signed areas of the cells of projected grids (..., rows, columns, 2)."""
     first = px[..., 1:, 1:, :] - px[..., :-1, :-1, :]
     second = px[..., 1:, :-1, :] - px[..., :-1, 1:, :]
-    areas: Floats = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-    return areas
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def grid_quads(grid: Floats) -> Floats:
@@ -151,8 +148,7 @@ def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> ND
 
 
 def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
-    share: NDArray[np.float32] = cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    return share / np.float32(255)
+    return np.asarray(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA), np.float32) / np.float32(255)
 
 
 def select_hiding(masks: MaskStack, points: Floats, others: Mapping[int, Floats]) -> dict[int, Floats]:
@@ -224,5 +220,4 @@ def _gaps(places: NDArray[np.int64], surface: tuple[cKDTree, Floats], own: tuple
     """(P,) how much farther a surface is than the own one at pixels (P, 2); each as image points and depths."""
     centres = places[:, ::-1] + 0.5
     far, near = (depth[tree.query(centres)[1]] for tree, depth in (surface, own))
-    gaps: Floats = far - near
-    return gaps
+    return np.asarray(far - near)

@@ -120,21 +120,17 @@ def _coefficients(middles: Floats, sides: Floats) -> Floats:
     last = middles[-1] + 0.5 * (middles[-1] - middles[-2])
     u = np.concatenate([[0.0], centres, [1.0]])
     coefficients = np.zeros((NUM_COEFFICIENTS, 3))
-    coefficients[MIDRIB] = _smooth_fit(u, np.concatenate([first[None], middles, last[None]]), COUNTS[0])
+    coefficients[MIDRIB] = _smoother(u.tobytes(), COUNTS[0]) @ np.concatenate([first[None], middles, last[None]])
     f = np.sqrt(4 * centres * (1 - centres))[:, None]
-    coefficients[SIDE] = _smooth_fit(centres, sides / f, COUNTS[1])
+    coefficients[SIDE] = _smoother(centres.tobytes(), COUNTS[1]) @ (sides / f)
     coefficients[FOLD], coefficients[CURL] = 0, 0
     return coefficients
 
 
-def _smooth_fit(u: Floats, values: Floats, count: int) -> Floats:
-    """(count, 3) spline coefficients near the values, with small second differences where the values leave freedom."""
-    return _smoother(u.tobytes(), count) @ values
-
-
 @cache
 def _smoother(places: bytes, count: int) -> Floats:
-    """(count, P) from values at the places u (P,) to the coefficients of `_smooth_fit`."""
+    """(count, P) from values at the places u (P,) to coefficients of a spline near them, with small second differences
+    where the values leave freedom."""
     u = np.frombuffer(places)
     rows = np.concatenate([spline_basis(u, count), STARTS.smooth * np.diff(np.eye(count), 2, axis=0)])
     return np.linalg.pinv(rows)[:, : len(u)]
