@@ -378,7 +378,7 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     earlier = run["config"] | {"corrections": "corrections.json"}  # a run with corrections can be corrected again
     (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0", "config": earlier}))
     notice = OpenResult(tmp_path).notice
-    assert notice.startswith("What you see is computed anew. This result was made by mvseg 0.0,")
+    assert notice.startswith("What you see is computed anew. This result was made by other code (mvseg 0.0;")
     assert OpenResult(folder).opened.config.match == MatchConfig()
 
 

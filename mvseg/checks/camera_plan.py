@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 from dataclasses import replace
 from html import escape
@@ -59,8 +60,10 @@ def draw_walk(scene: Scene, off: tuple[int, ...] = ()) -> tuple[str, str]:
     for view, ((x, y), turn) in enumerate(zip(places, turns, strict=True)):
         color = RED if view in off or not coverage.sees[view] else INK
         arrow = ARROW.format(200 + 140 * x, 200 - 140 * y, turn)
-        number = TEXT.format(200 + 158 * x, 204 - 158 * y, view)
-        parts.append(f'<g fill="{color}"><title>{escape(names[view])}</title>{arrow}{number}</g>')
+        # the frame's, in a film; of more than 30 cameras, each second or third one has room for it
+        number = int(names[view][6:]) if re.fullmatch(r"frame-\d+", names[view]) else view
+        text = TEXT.format(200 + 158 * x, 204 - 158 * y, "" if view % (1 + len(names) // 30) else number)
+        parts.append(f'<g fill="{color}"><title>{escape(names[view])}</title>{arrow}{text}</g>')
     texts = [TEXT.format(200, 396 + 18 * row, escape(line)) for row, line in enumerate(lines)]
     return sentence, "\n".join([*parts, *texts, "</svg>", ""])
 
@@ -70,8 +73,8 @@ def _axes_from_above(scene: Scene, rays: Floats) -> Floats:
     if scene.up is not None:
         up = np.array(scene.up)
     else:  # the cameras of a short walk are nearly on a line, which spans no plane
-        beside = np.vstack((scene.cameras.R[:, 0].numpy(), len(rays) ** 0.5 * rays.mean(0)))
-        up = np.linalg.svd(np.vstack((rays - rays.mean(0), CAMERAS.upright * beside)))[2][2]
+        beside = CAMERAS.beside * len(rays) ** 0.5 * rays.mean(0)
+        up = np.linalg.svd(np.vstack((rays - rays.mean(0), scene.cameras.R[:, 0].numpy(), beside)))[2][2]
         up = up if up @ scene.cameras.R[:, 1].numpy().sum(0) < 0 else -up
     right = np.linalg.svd(up[None])[2][1]
     return np.stack((right, np.cross(up, right)), 1)

@@ -35,10 +35,6 @@ class Check:
     photos: tuple[PhotoFacts, ...]
     agreement: PoseAgreement | None
 
-    @property
-    def has_errors(self) -> bool:
-        return any(finding.level == "error" for finding in self.findings)
-
 
 @check_arguments
 def check_scene(

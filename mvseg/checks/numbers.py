@@ -27,7 +27,7 @@ class CameraNumbers:
     alike: float = 2.0  # chosen: max. quotient of the distances of two groups of cameras in one unit
     narrow: float = 2.0  # chosen: degrees between the most different rays, below which there is no depth
     wide: float = 75.0  # chosen: degrees between the rays of neighbouring views, above which they share no leaves
-    upright: float = 0.3  # chosen: weight, where up is unknown, of upright photos taken from beside the plant
+    beside: float = 0.3  # chosen: weight, where up is unknown, of cameras beside the plant, to that of upright photos
     overhead: float = 0.25  # chosen: cosine of the elevation from which a camera stands above the plant, on no side
 
 

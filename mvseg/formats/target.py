@@ -17,7 +17,6 @@ from mvseg.errors import InputError
 from mvseg.formats.board import Family
 from mvseg.system.atomic import write_whole
 
-WIDTH, HEIGHT = 210.0, 297.0  # definition: of an A4 page, mm
 FAMILY: Family = "APRILTAG_36H11"
 PAGE = Path(__file__).with_suffix(".pdf")
 INK = "0.8353 0.0000 0.4706 rg\n"  # the colour of the shapes, as the page sets it: unlike wood, soil, skin and leaves

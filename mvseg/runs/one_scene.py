@@ -27,10 +27,9 @@ from mvseg.results.result import Result
 from mvseg.runs.recorded_run import record_places
 from mvseg.runs.request import RunRequest
 from mvseg.system.atomic import resolve_place, sweep_abandoned
+from mvseg.system.progress import PASSES, ROUND
 from mvseg.system.running import now_running, running, timed
 from mvseg.system.say import say
-
-PASSES = 3  # chosen: sizes that the detector looks at, of most plants that it does not know, and in each round
 
 
 def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
@@ -78,13 +77,13 @@ def run_one_scene(request: RunRequest, *, num_workers: int = 1) -> None:
 
 
 def _plan_stages(config: RunConfig, *, finds: bool) -> list[str]:
-    """Plan the stages of a run: all rounds of learning that it may need, and the passes that most need."""
-    first = ["match", "choose"]
+    """Plan the stages of a run: the passes that most need, and all rounds of learning that it may need."""
+    first: tuple[str, ...] = ("match", "choose")
     if finds:
         from mvseg.pipeline.learn import ROUNDS  # loads torchvision
 
-        first = ["detect", *first] * (PASSES if config.detect.image_size is None else 1)
-        first += ["snap", "learn", *first] * int({"off": 0, "auto": ROUNDS}.get(str(config.learn), config.learn))
+        first = PASSES if config.detect.image_size is None else ("detect", *first)
+        first += ROUND * int({"off": 0, "auto": ROUNDS}.get(str(config.learn), config.learn))
     shapes, traits = (("snap", "surfaces"), ("voxels", "measure")) if config.reconstruct is not None else ((), ())
     return ["load", *first, *shapes, "check", *traits, "write"]
 

@@ -98,8 +98,7 @@ def timed(stage: str) -> Iterator[None]:
     with nullcontext() if stage in NETWORKS else on_one_thread():
         yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
-    if now.progress.total:
-        now.progress.end(stage)
+    now.progress.end(stage, is_stage=True)
 
 
 def report_step(sentence: str) -> None:
@@ -137,14 +136,13 @@ class progress_bar:
                 self.update()
 
     def __enter__(self) -> progress_bar:
-        if not self.progress.total:
+        if not self.progress.is_planned:
             self.progress.begin(self.name)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.update(0, ends=True)
-        if not self.progress.total:
-            self.progress.end(self.name)
+        self.progress.end(self.name, is_stage=False)
 
     def update(self, more: int = 1, *, ends: bool = False) -> None:
         """Count more; show what stands `beside` it."""

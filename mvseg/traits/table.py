@@ -51,11 +51,13 @@ def write_nodes(path: Path, traits: Traits) -> None:
 
 
 def read_nodes(path: Path) -> tuple[Stem, ...]:
-    """The stems that `write_nodes` wrote, with straight axes from node to node. Raises InputError for another table."""
+    """The stems that `write_nodes` wrote, with straight axes from node to node; none of an older version, which counted
+    nodes otherwise. Raises InputError for another table."""
     nodes: dict[int, list[Node]] = {}
     about: dict[int, tuple[str, float, Phyllotaxis]] = {}
+    table = [row for row in read_csv(path, NODE_COLUMNS[:3]) if "leaves_per_node" in row]
     try:
-        for row in read_csv(path, NODE_COLUMNS):
+        for row in table:
             numbers = {
                 name: Measurement(_number(row[name]), _number(row[f"{name}_sd"]), row["source"])
                 for name in NODE_NUMBERS
@@ -69,8 +71,6 @@ def read_nodes(path: Path) -> tuple[Stem, ...]:
             likely = _number(row["stem_probability"])
             about[stem] = row["source"], likely, Phyllotaxis(row["phyllotaxis"], angle, probability)
     except (KeyError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(f"{path}: is no table of nodes that mvseg wrote ({error})") from None
     stems = []
     for number, rows in nodes.items():

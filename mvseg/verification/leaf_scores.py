@@ -228,11 +228,9 @@ def rate_pass(
 def order_ratings(ratings: Sequence[Rating]) -> list[int]:
     """Indices of the answers among ratings, the best one first, then by the agreed area.
 
-    The best one is the first whose agreed area no other exceeds by `CHOICE.growth`: equal runs differ by as much, so
-    ratings come in the order in which one would believe them, the usual size and the weights at hand first.
-
-    The area alone has a degenerate optimum: the whole plant as one leaf. So passes with too few leaves
-    (`CHOICE.least_leaves`) or too few correct masks (`CHOICE.least_expected`) are no answers, unless all are so.
+    The best one is the first whose agreed area no other exceeds by `CHOICE.growth`: less is chance. The area alone has
+    a degenerate optimum, the whole plant as one leaf; so passes with too few leaves (`CHOICE.least_leaves`) or correct
+    masks (`CHOICE.least_expected`) are no answers, unless all are so.
     """
     least = CHOICE.least_expected * max((each.expected for each in ratings), default=0.0)
     is_answer = [each.num_leaves >= CHOICE.least_leaves and each.expected >= least for each in ratings]

@@ -37,7 +37,6 @@ class ChoiceNumbers:
     least_views: int = 2  # definition: min. views in which a leaf has masks; one view alone is no agreement
     least_leaves: int = 3  # chosen: fewer say too little of a plant, to choose a size by or to learn from
     least_expected: float = 0.33  # chosen: min. expected correct masks of a pass, relative to the pass with most
-    # Of rounds that grew by 1.04 to 1.08, four of five gained MV-PQ, 0.03 to 0.09; of five that did not, four lost.
     growth: float = 1.03  # chosen: a smaller size, or taught weights, are better if the agreed area grows by it
     digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
 

@@ -291,6 +291,8 @@ def test_tables_of_nodes_are_read_as_they_were_written(tmp_path: Path) -> None:
     path.write_text(text.replace(",1,1,2,", ",x,1,2,", 1))
     with pytest.raises(InputError, match="no table of nodes"):
         read_nodes(path)
+    path.write_text(text.replace("leaves_per_node", "as_an_older_version"))
+    assert read_nodes(path) == ()
 
 
 def test_in_the_graph_of_a_plant_leaves_hang_on_their_nodes_and_others_on_the_plant() -> None:

@@ -99,6 +99,11 @@ class Space {
   }
 
   drawNow() {
+    // what stands before the viewer's eyes would hide the plant
+    const near = this.camera.position.distanceTo(this.controls.target) / 2;
+    for (const { center, group } of this.cameras) {
+      for (const part of group.children) part.visible = center.distanceTo(this.camera.position) > near;
+    }
     this.renderer.render(this.scene, this.camera);
     this.placeLabels();
     for (const { text, spot } of this.labels) {
@@ -111,21 +116,26 @@ class Space {
     }
   }
 
-  // No label lies on another: the nearer one stays, and the other moves aside, or is hidden. Each gets its `spot`.
+  // No label lies on another or over the edge: the nearer one stays, and the other moves aside, or is hidden. Each gets
+  // its `spot`.
   placeLabels() {
     const { selected, hovered } = selection;
     const isLit = ({ leaf }) => Boolean(leaf) && [selected, hovered].includes(leaf.id);
     const isShown = ({ leaf }) => (leaf ? this.layers.leaves.checked && this.layers.numbers.checked : this.ground.visible);
     const ordered = this.labels.map((label) => ({ label, ...this.pixelOf(label.at) }))
       .sort((a, b) => isLit(b.label) - isLit(a.label) || a.depth - b.depth);
+    const { clientWidth, clientHeight } = this.canvas;
+    const within = (at, length, size) => Math.min(Math.max(at, size / 2), length - size / 2);
     const placed = [];
     for (const { label, x, y, depth } of ordered) {
       const width = LABEL.letter * (label.text.textContent.length + 0.5);
       const tries = LABEL.steps.flatMap((step) => [0, 1, 2, 3, 4, 5, 6, 7].map((n) =>
-        [x + step * Math.cos(n * Math.PI / 4), y + step * Math.sin(n * Math.PI / 4)]));
+        [within(x + step * Math.cos(n * Math.PI / 4), clientWidth, width),
+          within(y + step * Math.sin(n * Math.PI / 4), clientHeight, LABEL.line)]));
+      const isInside = Math.abs(x - within(x, clientWidth, 0)) < width && y === within(y, clientHeight, 0);
       const isFree = ([left, top]) => placed.every(([otherX, otherY, other]) =>
         Math.abs(left - otherX) > (width + other) / 2 || Math.abs(top - otherY) > LABEL.line);
-      label.spot = (depth < 1 && isShown(label) && tries.find(isFree)) || null;
+      label.spot = (depth < 1 && isInside && isShown(label) && tries.find(isFree)) || null;
       if (label.spot) placed.push([...label.spot, width]);
     }
   }
