@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import pytest
 import torch
+from threadpoolctl import ThreadpoolController
 
 from mvseg import demo
 from mvseg.cli import command
@@ -19,7 +20,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions
 from mvseg.scene import Scene
-from mvseg.system import worker_pool
+from mvseg.system import threads, worker_pool
 
 ROOT = Path(__file__).parent.parent
 if "OMP_NUM_THREADS" not in os.environ:
@@ -43,9 +44,13 @@ def one_parser() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def one_worker() -> Iterator[None]:
-    """Commands fit surfaces in the process of the test: another one would load all libraries for some leaves."""
+    """Commands fit surfaces in the process of the test: another one would load all libraries for some leaves. Libraries
+    are looked for once, and nobody waits for the disk."""
+    libraries = ThreadpoolController()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(worker_pool, "default_workers", lambda: 1)
+        patch.setattr(threads, "threadpool_limits", lambda limits, **of: libraries.limit(limits=limits, **of))
+        patch.setattr(os, "fsync", lambda _: None)
         yield
 
 

@@ -15,11 +15,12 @@ from skimage.draw import polygon2mask
 from mvseg.formats.board import marker_dictionary
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.rig import write_rig
-from mvseg.formats.target import FAMILY, HEIGHT, WIDTH, list_shapes, tag_corners
+from mvseg.formats.target import FAMILY, list_shapes, tag_corners
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.scene_writer import write_jpeg
 
 TABLE = np.array([500, 600])  # mm; the page lies in its middle
+WIDTH, HEIGHT = 210.0, 297.0  # of an A4 page, mm
 MIDDLE = np.array([WIDTH / 2, HEIGHT / 2])
 LARGER = 2  # photos are drawn so many times larger, and shrunk
 GAMMA = 2.2

@@ -25,7 +25,7 @@ from tiny_training import build_tiny
 pytestmark = pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 
 WIDTH, HEIGHT = 80, 60
-CAMERAS = cameras_at(arc_positions(3), focal=100.0, width=WIDTH, height=HEIGHT)
+CAMERAS = cameras_at(arc_positions(2), focal=100.0, width=WIDTH, height=HEIGHT)
 FLOATS, WHOLE = ("boxes", "scores", "masks", "match_scores"), ("labels", "instance_ids", "frame", "scale")
 
 
@@ -38,7 +38,7 @@ def model() -> MaskRCNN:
 
 @pytest.fixture
 def photos() -> list[Tensor]:
-    return list(torch.rand((3, 3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1)))
+    return list(torch.rand((2, 3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1)))
 
 
 def there(module: Any, device: torch.device) -> Any:
@@ -80,7 +80,7 @@ def test_nothing_found(model: MaskRCNN, photos: list[Tensor]) -> None:
         }
         assert list(masks) == []
         results = MultiViewMaskRCNN(there(model, device))([each.to(device) for each in photos], cameras=CAMERAS)
-        assert [result["instance_ids"].device for result in results] == [device] * 3
+        assert [result["instance_ids"].device for result in results] == [device] * 2
         assert {len(value) for result in results for value in result.values()} == {0}
 
 
@@ -133,6 +133,7 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
         return Leaves(proposals, surfaces={}, probabilities={}, rejected=(), keys={})
 
     monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.choose_size", lambda _, first: [first])
     results = wrapped(photos, cameras=CAMERAS)
     with other_device() as device:
         answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
@@ -148,7 +149,7 @@ def test_autocast_there_reaches_the_backbone_and_no_boxes(model: MaskRCNN, photo
         wrapped.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
         with torch.autocast(device.type, torch.bfloat16):
             results = wrapped([photo.to(device) for photo in photos], cameras=CAMERAS)
-        assert seen == [torch.bfloat16, torch.float32] * 3
+        assert seen == [torch.bfloat16, torch.float32] * 2
         for result in results:
             check(result, {key: value.cpu() for key, value in result.items()}, device)
             assert not torch.equal(result["boxes"], result["boxes"].bfloat16().float())

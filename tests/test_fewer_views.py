@@ -135,8 +135,9 @@ def test_a_result_says_which_views_it_shows_and_is_made_again_with_them(
     assert sorted(path.stem for path in (out / "labels").iterdir()) == taken(plant, 5)
     assert main(["infer", "--again", str(out), "--quiet"]) == 0
     assert json.loads((out / "run.json").read_text())["views"] == run["views"]
-    assert main(["infer", str(plant), "--masks", "masks", *plain]) == 0
-    assert json.loads((out / "run.json").read_text())["views"] == {"taken": taken(plant, "all"), "left_out": []}
+    assert main(["match", str(plant), "--masks", "masks", *plain[2:5], "--out", str(tmp_path / "all")]) == 0
+    run = json.loads((tmp_path / "all" / plant.name / "run.json").read_text())
+    assert run["views"] == {"taken": taken(plant, "all"), "left_out": []}
 
 
 def test_a_result_is_corrected_in_its_own_views_and_in_those_that_were_corrected_before(

@@ -151,7 +151,7 @@ def test_a_batch_goes_on_where_it_was_killed(runs: Runs, tmp_path: Path, monkeyp
     plants = [write_scene(tmp_path / "plants" / name, 2 + number % 2) for number, name in enumerate(names)]
     run = ["batch", str(plants[0].parent), "--masks", "masks", "--out", str(out), "--quiet", "--num_workers", "2"]
     run += ["--resume", "true", "--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
-    monkeypatch.setattr("mvseg.batch.workers.run_locally", run_here)
+    monkeypatch.setattr("mvseg.batch.run_batch.run_locally", run_here)
     monkeypatch.chdir(tmp_path)  # where no masks/ lies
     assert main([*run, "--match.seed", "7", "--unit", "cm", "--scale", "0.1"]) == 0
     shutil.copytree(out, earlier)

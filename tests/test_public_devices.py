@@ -48,7 +48,7 @@ from mvseg.verification.snap_edges import snap_masks
 from other_device import other_device
 from synthetic import ball_scene
 
-SCENE = ball_scene(2, 4, seed=1)
+SCENE = ball_scene(2, 3, seed=1)
 IDS = SCENE.regions.labels
 CPU = torch.device("cpu")
 COARSE, XY = ReconstructConfig(voxel_budget=2_000), torch.tensor([[0.5, 0.5], [100.5, 80.5], [90.5, 95.5]])

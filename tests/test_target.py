@@ -18,11 +18,11 @@ from mvseg.demo import demo_scene
 from mvseg.formats.markers import find_markers, read_grey
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
-from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_corners
+from mvseg.formats.target import FAMILY, TAG, list_shapes, tag_corners
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.result import Result
 from mvseg.runs import check_target
-from photographed_page import MIDDLE, aim_cameras, write_photos
+from photographed_page import HEIGHT, MIDDLE, WIDTH, aim_cameras, write_photos
 
 
 def photograph(folder: Path, num_views: int) -> Path:

@@ -87,8 +87,7 @@ def _place_rules(cameras: Cameras, coverage: Coverage) -> list[Rule]:
     distance = np.linalg.norm(centers - np.median(centers, 0), axis=1)
     usual = float(np.median(distance))
     far = np.flatnonzero(distance > CAMERAS.far * usual).tolist() if total > 3 and usual > 0 else []
-    ratio = float(distance.max()) / max(usual, 1e-300)
-    return [*rules, ("far_out", "warning", far, {"ratio": ratio})]
+    return [*rules, ("far_out", "warning", far, {"ratio": float(distance.max()) / max(usual, 1e-300)})]
 
 
 def _baseline_rules(cameras: Cameras, coverage: Coverage) -> list[Rule]:
@@ -107,11 +106,10 @@ def _lens_rules(cameras: Cameras) -> list[Rule]:
     focal, center = K[:, [0, 1], [0, 1]], K[:, :2, 2]
     degrees, (least, most) = field_of_view(cameras), CAMERAS.field_of_view
     beside = np.abs(center / sizes - 0.5).max(1)
-    ratio = focal.max(1) / focal.min(1)
     rules = (
         ("odd_field_of_view", (degrees < least) | (degrees > most), "degrees", degrees),
         ("odd_principal_point", beside > CAMERAS.off_center, "share", beside),
-        ("odd_focal_lengths", focal.max(1) > CAMERAS.square * focal.min(1), "ratio", ratio),
+        ("odd_focal_lengths", focal.max(1) > CAMERAS.square * focal.min(1), "ratio", focal.max(1) / focal.min(1)),
     )
     return [
         (code, "warning", np.flatnonzero(is_odd).tolist(),

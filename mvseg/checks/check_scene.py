@@ -67,7 +67,4 @@ def check_scene(
             agreement = pairwise_agreement(regions, scene.cameras)
             findings += low_fit_findings(regions, scene.cameras, agreement, is_detected=is_detected)
             findings += pose_findings(agreement, names) + group_findings(agreement, names)
-    causes = keep_causes(findings)
-    return Check(
-        scene=scene, regions=regions, findings=causes, coverage=coverage, photos=tuple(facts), agreement=agreement
-    )
+    return Check(scene, regions, keep_causes(findings), coverage, tuple(facts), agreement)

@@ -84,13 +84,12 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
         same[facts[view].digest].append(view)
-    twins = [views for views in same.values() if len(views) > 1]
     return [
         ("blank_photo", "error", blank, {}),
         ("dark_photo", "warning", [view for view, each in contents.items() if each.level < IMAGES.dark], {}),
         ("overexposed_photo", "warning", [view for view, each in contents.items() if each.burnt > IMAGES.burnt], {}),
         ("grey_photo", "note", [view for view, each in contents.items() if each.grey], {}),
-        *(("same_photo", "error", views, {}) for views in twins),
+        *(("same_photo", "error", views, {}) for views in same.values() if len(views) > 1),
     ]
 
 

@@ -119,8 +119,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     whole scene if most do not (warnings where views or masks are few); a warning for lines that miss a little. Nothing
     where there are no masks to compare."""
     view = view_agreement(pairs)
-    compared = pairs.num_masks[pairs.num_masks > 0]
-    if not len(compared):
+    if not (pairs.num_masks > 0).any():
         return []
     level: Level = "error" if is_sure(pairs) else "warning"
     if not view.agree:
@@ -181,8 +180,7 @@ def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
 def _residuals(first: _Spans, second: _Spans, moves: Tensor) -> Tensor:
     """(S, N, M) pixels between the ends of two views' masks, after S moves (S, M) of the second's, radians."""
     apart = first.ends[:, None] - second.ends
-    px = torch.hypot(first.pitch[:, None], second.pitch)
-    return ((apart - moves[:, None, :, None]) / px).abs().amax(3)
+    return ((apart - moves[:, None, :, None]) / torch.hypot(first.pitch[:, None], second.pitch)).abs().amax(3)
 
 
 def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:

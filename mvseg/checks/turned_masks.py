@@ -65,8 +65,7 @@ def take_out_of_square(regions: Regions, cameras: Cameras) -> Regions:
 def transpose(regions: Regions, _: Cameras) -> Regions:
     """The masks with rows and columns exchanged, of square photos."""
     crops = [regions.crop(index).T.flatten() for index in range(len(regions))]
-    flipped = regions.boxes[:, [1, 0, 3, 2]]
-    return replace(regions, boxes=flipped, crops=torch.cat(crops) if crops else regions.crops)
+    return replace(regions, boxes=regions.boxes[:, [1, 0, 3, 2]], crops=torch.cat(crops) if crops else regions.crops)
 
 
 def turn_by_180(regions: Regions, cameras: Cameras) -> Regions:

@@ -108,8 +108,7 @@ def _run_target(args: Namespace) -> int:
     if args.out is not None:
         check_file(args.out / TARGET_FILE, b'"shapes"')
     check = check_target(args.scene, bar=BAR if args.bar is None else args.bar)
-    off = f"{check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags"
-    say(f"{args.scene}: {check.num_tags} tags, {off}")
+    say(f"{args.scene}: {check.num_tags} tags, {check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags")
     line = "{:12} {:>13} {:>13} {:>9} {:>7} {:>5} {:>10}"
     say("\n" + line.format("shape", "true", "measured", "sd", "error", "95 %", "photos"))
     for shape in check.shapes:
@@ -153,8 +152,7 @@ def _rows(check: Check) -> list[dict[str, Any]]:
     border, (fit, miss) = counts, np.full((2, num), np.nan)
     if regions is not None:
         counts = regions.num_per_view.tolist()
-        at_border = touches_border(regions, check.scene.cameras)
-        border = regions.view_index[at_border].bincount(minlength=num).tolist()
+        border = regions.view_index[touches_border(regions, check.scene.cameras)].bincount(minlength=num).tolist()
     if check.agreement is not None:
         agreement = view_agreement(check.agreement)
         fit, miss = agreement.fitting, agreement.offset_px

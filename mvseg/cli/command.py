@@ -102,8 +102,7 @@ def _parse(arguments: Sequence[str]) -> Namespace:
                 raise InputError("--print_completion needs shtab: pip install shtab")
             set_parsing_settings(add_print_completion_argument=True)
         short = not {"--help_all", "--print_completion"} & {*arguments}
-        words = ["--help" if word == "--help_all" else word for word in arguments]
-        args = build_parser(short=short).parse_args(words)
+        args = build_parser(short=short).parse_args(["--help" if word == "--help_all" else word for word in arguments])
         for name, value in args[args.verb].items() if args.verb else ():
             if value is None and name in ("quiet", "report", "coco_crowd", "overwrite"):
                 raise InputError(f"{name} is null, expected a value")

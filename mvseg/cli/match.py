@@ -33,8 +33,7 @@ def run(args: Namespace) -> int:
     code, out = 0, args.out or DEFAULT_OUT
     plain = {name: args[name] for name in ("report", "coco_crowd", "categories")}
     shared = {name: args[name] for name in OF_REQUEST}
-    match = build_options(MatchConfig, args.match, "match.")
-    config = RunConfig(views="all", match=match, reconstruct=None, **plain)
+    config = RunConfig(views="all", match=build_options(MatchConfig, args.match, "match."), reconstruct=None, **plain)
     for scene, name in zip(args.scenes, names, strict=True):
         try:
             run_one_scene(RunRequest(scene, args.masks, out / name, config, **shared))

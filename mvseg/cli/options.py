@@ -100,8 +100,7 @@ def add_shared(parser: ArgumentParser, *names: str) -> None:
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None = None) -> None:
     """The options of every verb that matches; `masks` is the default of --masks."""
-    help_config = "YAML file with any of these options; paper.yaml ships"
-    parser.add_argument("--config", action=CheckedConfig, help=help_config)
+    parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options; paper.yaml ships")
     add_shared(parser, "masks", "coco_crowd", "categories", "quiet")
     parser.set_defaults(masks=masks)
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
@@ -131,12 +130,8 @@ def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
     plain = ("views", "scale", "unit", "report", "coco_crowd", "categories", "stem_category")
     stages: dict[str, Any] = {name: build_options(kind, args[name], f"{name}.") for name, kind in STAGES.items()}
-    return RunConfig(
-        **stages,
-        learn="off" if args.learn is False else args.learn,  # YAML takes off for false
-        up=read_up(args.up),
-        **{name: args[name] for name in plain},
-    )
+    learn: Any = "off" if args.learn is False else args.learn  # YAML takes off for false
+    return RunConfig(**stages, learn=learn, up=read_up(args.up), **{name: args[name] for name in plain})
 
 
 def join_up(argv: Sequence[str]) -> list[str]:

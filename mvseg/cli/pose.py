@@ -45,13 +45,8 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def run(args: Namespace) -> int:
-    world = WorldFacts(
-        board=args.board if args.board is None else BoardConfig(**vars(args.board)),
-        marker=args.marker,
-        distance=_read_distance(args.distance),
-        positions=args.positions,
-        unit=args.unit or "",
-    )
+    board = None if args.board is None else BoardConfig(**vars(args.board))
+    world = WorldFacts(board, args.marker, _read_distance(args.distance), args.positions, unit=args.unit or "")
     config = build_options(PoseConfig, args)
     if args.turntable in (None, "board") and args.angles is not None:
         raise InputError("--angles has no effect without --turntable and a turntable.json")

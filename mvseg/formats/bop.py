@@ -33,9 +33,8 @@ class _Cameras(RootModel[dict[int, _Camera]]):
 def read_bop(path: Path) -> Scene:
     """Read a scene_camera.json, views by number, called 000000, 000001, ... Raises InputError if the file is missing or
     broken, an image has no pose (BOP allows that) or no photo, or a camera is unsound; see `build_scene`."""
-    cameras = read_json(path, _Cameras).root
     photos = []
-    for number, camera in sorted(cameras.items()):
+    for number, camera in sorted(read_json(path, _Cameras).root.items()):
         if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
             raise InputError(f"{path}: image {number} has no cam_R_w2c or cam_t_w2c, expected the pose of each camera")
         files = [f"{place}/{number:06d}{suffix}" for place in ("rgb", "gray") for suffix in PHOTO_SUFFIXES]

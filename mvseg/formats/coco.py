@@ -165,12 +165,10 @@ def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoFile | None
     """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
     ids, fitting = {str(result.image_id) for result in results}, []
     for other in sorted(path.parent.glob("*.json")):
-        try:
+        with suppress(InputError):  # no COCO file, which includes the results
             listed = read_json(other, CocoFile)
-        except InputError:  # no COCO file, which includes the results
-            continue
-        if ids and ids <= {str(image.id) for image in listed.images}:
-            fitting.append(listed)
+            if ids and ids <= {str(image.id) for image in listed.images}:
+                fitting.append(listed)
     return fitting[0] if len(fitting) == 1 else None
 
 

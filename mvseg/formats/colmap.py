@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,13 @@ def find_colmap_model(folder: Path) -> Path | None:
 
 def _count_photos(model: Path) -> int:
     """Number of photos that a model registers, without reading it; 0 if unknown."""
-    try:
+    with suppress(OSError, struct.error):
         if (model / "images.bin").is_file():
             with (model / "images.bin").open("rb") as file:
                 return int(struct.unpack("<Q", file.read(8))[0])
         with (model / "images.txt").open(encoding="utf-8", errors="replace") as file:
             return sum(not line.startswith("#") for line in file) // 2  # of each photo: its pose, its points
-    except (OSError, struct.error):
-        return 0
+    return 0
 
 
 def read_colmap(model: Path, folder: Path) -> Scene:
@@ -67,8 +67,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
                 reconstruction.images[image_id].name = name
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)  # which may be no UTF-8
     except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{model}: cannot be read as a COLMAP model ({reason})") from None
+        raise InputError(f"{model}: cannot be read as a COLMAP model ({' '.join(str(error).split())})") from None
     photos = [_photo(model, image, reconstruction.cameras[image.camera_id]) for image in images if image.has_pose]
     scene = build_scene(folder, photos, unit="", source=model)
     registered, images_folder = {view.path for view in scene.views}, folder / "images"

@@ -95,8 +95,7 @@ def find_file(path: Path) -> Path:
 
 def natural_order(name: str) -> list[tuple[int, int | str]]:
     """A key for natural sorting: 2.jpg before 10.jpg."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name.lower())]
 
 
 def _exact_views(names: Sequence[str], scene: PhotoSet, in_source: str) -> list[int | None]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
@@ -71,7 +71,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """
     with _any_fault():
         with path.open("rb") as file:
-            reader = _find_reader(file.read(16))
+            reader = _find_reader(file)
         most = MARGIN_BYTES + PIXEL_BYTES * (MAX_PIXELS if size is None else size[0] * size[1])
         if path.stat().st_size > most:
             raise InputError(f"it is a file of {path.stat().st_size} bytes, expected at most {most}")
@@ -121,9 +121,7 @@ def _turn_back(image: ImageFile, turn: int) -> Image.Image:
 def read_image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, as stored, by the header. Raises InputError as `read_image`, as far as that shows."""
     with _any_fault(), path.open("rb") as file:
-        reader = _find_reader(file.read(16))
-        file.seek(0)
-        image = reader(file)
+        image = _find_reader(file)(file)
         is_swapped = _is_turned_by_decoder(image) and _orientation_of(image) >= 5  # as it will be turned
     return image.size[::-1] if is_swapped else image.size
 
@@ -140,7 +138,10 @@ def _any_fault() -> Iterator[None]:
         raise InputError(reason or type(error).__name__) from None
 
 
-def _find_reader(start: bytes) -> Callable[[IO[bytes]], ImageFile]:
+def _find_reader(file: IO[bytes]) -> Callable[[IO[bytes]], ImageFile]:
+    """The reader of an open file, by its first bytes; the file stays at its start."""
+    start = file.read(16)
+    file.seek(0)
     if start[4:8] == b"ftyp" and start[8:12] in BRANDS:
         return open_heic
     for magic, reader in READERS:
@@ -176,11 +177,10 @@ def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
     """Number of bits that an image uses: 8, or 10, 12, 14 or 16 in a file of 16 bits; 8 also for a file that cannot be
     read or has another size (see `read_image`). Only 16-bit files are decoded; the answer is cached until the file
     changes."""
-    try:
+    with suppress(InputError, OSError):
         facts = path.stat()
         return _bits_of_file(path, size, facts.st_mtime_ns, facts.st_size)
-    except (InputError, OSError):
-        return 8
+    return 8
 
 
 @lru_cache(maxsize=4096)
@@ -188,7 +188,7 @@ def _bits_of_file(path: Path, size: tuple[int, int] | None, modified_ns: int, nu
     with _any_fault(), path.open("rb") as file:
         head = file.read(26)
         file.seek(0)
-        if not _is_deep(head, _find_reader(head)(file)):
+        if not _is_deep(head, _find_reader(file)(file)):
             return 8
     deep = read_deep(path, read_image(path, size))
     return 8 if deep is None else _bits_of(deep)
@@ -227,13 +227,9 @@ def is_grey(pixels: np.ndarray) -> bool:
 
 def read_orientation(path: Path) -> int:
     """How viewers are asked to rotate or mirror an image, 1 to 8 as in EXIF; 1 (not at all) where nothing is said."""
-    try:
-        with _any_fault(), path.open("rb") as file:
-            reader = _find_reader(file.read(16))
-            file.seek(0)
-            return _orientation_of(reader(file))
-    except InputError:  # no image, or a damaged EXIF block: it says nothing
-        return 1
+    with suppress(InputError), _any_fault(), path.open("rb") as file:  # a damaged EXIF block says nothing
+        return _orientation_of(_find_reader(file)(file))
+    return 1
 
 
 def is_turned(path: Path) -> bool:
@@ -251,10 +247,8 @@ def _orientation_of(image: ImageFile) -> int:
             exif.load(_find_chunk(image.fp, b"eXIf"))
             image.fp.seek(at)
         tag = exif.get(ORIENTATION)
-    elif TURN in image.info:
-        tag = image.info[TURN]
     else:
-        tag = image.getexif().get(ORIENTATION)
+        tag = image.info[TURN] if TURN in image.info else image.getexif().get(ORIENTATION)
     return tag if isinstance(tag, int) and 1 <= tag <= 8 else 1
 
 
@@ -278,12 +272,10 @@ def turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
 def read_exposure(path: Path) -> float:
     """Exposure of a JPEG by EXIF, in stops: log2(seconds x ISO / f-number^2); the same object in the same light is
     brighter where it is larger. NaN if EXIF lacks one of the three."""
-    try:
-        with _any_fault(), path.open("rb") as file:
-            said = JpegImageFile(file).getexif().get_ifd(EXPOSURE_BLOCK)
-            return math.log2(float(said[SECONDS]) * float(said[ISO]) / float(said[APERTURE]) ** 2)
-    except InputError:  # as `is_turned`
-        return math.nan
+    with suppress(InputError), _any_fault(), path.open("rb") as file:  # as `read_orientation`
+        said = JpegImageFile(file).getexif().get_ifd(EXPOSURE_BLOCK)
+        return math.log2(float(said[SECONDS]) * float(said[ISO]) / float(said[APERTURE]) ** 2)
+    return math.nan
 
 
 def describe_turn(path: Path) -> str:
@@ -297,16 +289,13 @@ def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | N
     starts_elsewhere = os.path.isabs(path) or path.startswith(os.sep) or os.path.splitdrive(path)[0]  # on Windows, too
     if starts_elsewhere or path.split(os.sep)[0] == "..":
         return f"the file name leads out of {folder}"
-    if path == "." or "\0" in path:
-        return "this is not the name of a file"
-    return None
+    return "this is not the name of a file" if path == "." or "\0" in path else None
 
 
 def write_png(path: Path, image: np.ndarray) -> None:
     """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB. Raises OSError if the file cannot be written."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".png", pixels)
-    path.write_bytes(encoded.tobytes())
+    path.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
 
 
 def encode_jpeg(image: np.ndarray, *, quality: int) -> bytes:

@@ -64,8 +64,7 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
     if image.mode in ("I", "F"):
         raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
     labels = np.asarray(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
-    has_numbers = bool(((labels > 0) & (labels < VOC_BORDER)).any())
-    if image.mode == "P" and has_numbers and not _clear_background(labels, path):
+    if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any() and not _clear_background(labels, path):
         labels[labels == VOC_BORDER] = IGNORE_LABEL
     return labels
 
@@ -173,8 +172,7 @@ def read_mask_images(paths: Sequence[Path], width: int, height: int) -> list[Fou
     for number, path in enumerate(paths, start=1):
         image = open_labels(path, (width, height))
         pixels = np.atleast_3d(np.asarray(image))
-        has_alpha = image.mode in ("RGBA", "LA")
-        mask = pixels[..., :-1].any(2) & (pixels[..., -1] > 0) if has_alpha else pixels.any(2)
+        mask = pixels[..., :-1].any(2) & (pixels[..., -1] > 0) if image.mode in ("RGBA", "LA") else pixels.any(2)
         masks.append(FoundMask(number, np.asarray(mask)))
     return masks
 

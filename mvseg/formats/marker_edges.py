@@ -37,8 +37,7 @@ def fit_grid(photo: NDArray[np.uint8], quad: Floats, is_white: NDArray[np.bool_]
         axes = [_find_edges(photo, px_from_grid, white, axis) for axis, white in enumerate((is_white, is_white.T))]
         rows, places, is_outer = (np.concatenate(each) for each in zip(*axes, strict=True))
         shift = np.linalg.lstsq(rows, places, rcond=None)[0][8]
-        unshifted = (places - shift * rows[:, 8])[is_outer]
-        fit = np.linalg.lstsq(rows[is_outer, :8], unshifted, rcond=None)[0]
+        fit = np.linalg.lstsq(rows[is_outer, :8], (places - shift * rows[:, 8])[is_outer], rcond=None)[0]
         moves = np.column_stack([np.ones(4), square]) @ fit[:6].reshape(2, 3).T + square * (square @ fit[6:8])[:, None]
         quad = np.asarray(cv2.perspectiveTransform((square + moves)[None], px_from_grid)[0], np.float64)
     return quad

@@ -15,6 +15,7 @@ A slave of a rig has no `transform`: it is that of its master times the offset o
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -38,13 +39,10 @@ UNKNOWN_NAMES = ("k4", "p3", "p4")  # numbers of the lens that OpenCV's model do
 def find_metashape(folder: Path) -> Path | None:
     """The XML file of cameras in a scene folder: the first whose content looks like Metashape's; None if none does."""
     for path in sorted(folder.glob("*.xml")):
-        try:
-            with path.open("rb") as file:
-                head = file.read(4096)
-        except OSError:
-            continue
-        if b"<document" in head and b"<chunk" in head:
-            return path
+        with suppress(OSError), path.open("rb") as file:
+            head = file.read(4096)
+            if b"<document" in head and b"<chunk" in head:
+                return path
     return None
 
 
@@ -83,8 +81,7 @@ def read_metashape(path: Path) -> Scene:
         warn(Finding("cameras_not_aligned", str(path), {"count": num_left_out}))
     if slaves:
         warn(Finding("slaves_left_out", str(path), {"count": len(slaves), "slaves": tuple(slaves)}))
-    unit = "" if world_from_chunk is None else "m"
-    return build_scene(path.parent, photos, unit=unit, source=path)
+    return build_scene(path.parent, photos, unit="" if world_from_chunk is None else "m", source=path)
 
 
 def _read_chunk(path: Path) -> ElementTree.Element:

@@ -103,16 +103,16 @@ def find_photo(folder: Path, file: str) -> str:
     `images/`.
     """
     name = file.replace("\\", "/").rsplit("/", 1)[-1].lower()
-    if not file_name_problem(file):
-        if (folder / file).is_file():
-            return file
-        parent = (folder / file).parent
-        matches = [path for path in photos_in(parent) if _is_named(path, name)]
+    leads_out = file_name_problem(file) is not None
+    if not leads_out and (folder / file).is_file():
+        return file
+    beside = [] if leads_out else [((folder / file).parent, "*")]
+    for places in (beside, [(folder, "*"), (folder / "images", "**/*")]):
+        photos = [path for place in places for path in photos_in(*place)]
+        matches = [path for path in photos if name in (path.name.lower(), path.stem.lower())]
         if len(matches) == 1:
             return matches[0].relative_to(folder).as_posix()
-    photos = [*photos_in(folder), *photos_in(folder / "images", "**/*")]
-    matches = [path for path in photos if _is_named(path, name)]
-    return matches[0].relative_to(folder).as_posix() if len(matches) == 1 else file
+    return file
 
 
 def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
@@ -133,10 +133,6 @@ def photos_in(folder: Path, pattern: str = "*") -> list[Path]:
     except (OSError, ValueError):  # not readable, or a name that no file system takes
         return []
     return [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES and not path.name.startswith(".")]
-
-
-def _is_named(path: Path, name: str) -> bool:
-    return name in (path.name.lower(), path.stem.lower())
 
 
 def view_names(files: Sequence[str]) -> list[str]:

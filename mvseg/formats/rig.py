@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
@@ -59,11 +60,10 @@ class _Rig(BaseModel):
 def is_rig(path: Path) -> bool:
     """Whether a cameras.json is meant as a rig file, valid or not; other programs (3D Gaussian splatting) use this
     name, too."""
-    try:
+    with suppress(InputError):  # `read_rig` says what is wrong
         content = load_json(path)
-    except InputError:
-        return True  # `read_rig` says what is wrong
-    return isinstance(content, dict) and ("views" in content or str(content.get("format")).startswith("mvseg"))
+        return isinstance(content, dict) and ("views" in content or str(content.get("format")).startswith("mvseg"))
+    return True
 
 
 def read_rig(path: Path) -> Scene:

@@ -61,8 +61,7 @@ def shared_neighbours(runs: NDArray[np.int64], width: int, height: int) -> tuple
     counts = np.append(0, np.stack([0 * starts, stops - starts], 1).ravel().cumsum())
 
     def shared(step: int) -> float:
-        inside = np.interp(stops + step, places, counts) - np.interp(starts + step, places, counts)
-        return float(inside.sum())
+        return float((np.interp(stops + step, places, counts) - np.interp(starts + step, places, counts)).sum())
 
     return shared(height), shared(width)
 
@@ -90,7 +89,7 @@ def _decompress(counts: str) -> list[int]:
     numbers -= (bits[last] & 0x10 != 0) * (1 << 5 * lengths)  # the sign
     for start in (1, 2):
         numbers[start::2] = numbers[start::2].cumsum()
-    return [int(number) for number in numbers]
+    return numbers.tolist()
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:

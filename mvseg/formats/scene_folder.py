@@ -60,8 +60,7 @@ def _read_cameras(folder: Path) -> Scene:
         problem = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
         raise InputError(f"{folder}: {problem}")
     rig = folder / "cameras.json"
-    is_own = rig.is_file() and is_rig(rig)
-    scene = None if is_own else _read_others(folder)
+    scene = None if rig.is_file() and is_rig(rig) else _read_others(folder)
     if scene is not None:
         if rig.is_file():
             warn(Finding("rig_not_used", str(rig), {"source": str(scene.source)}))
@@ -127,6 +126,5 @@ def read_masks(scene: Scene, files: MaskFiles, *, crowd: Crowd = "mask", categor
     if files.kind == "COCO":
         parts = files.files[0]
         path = parts[0] if len(parts) == 1 else files.source
-        views = read_coco(path, scene, parts=parts, crowd=crowd, categories=categories)
-        return stack_views(views, scene, source=path)
+        return stack_views(read_coco(path, scene, parts=parts, crowd=crowd, categories=categories), scene, source=path)
     return stack_views(read_views(scene, files, wanted=categories), scene, source=files.source)

@@ -60,8 +60,7 @@ def list_shapes() -> tuple[Shape, ...]:
 def tag_corners() -> dict[int, Floats]:
     """{number of the tag: (4, 2) corners, clockwise from its top left}."""
     square = TAG * np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
-    places = [(x, y) for y in TAG_ROWS for x in TAG_COLUMNS]
-    return {number: square + place for number, place in enumerate(places)}
+    return {number: square + place for number, place in enumerate((x, y) for y in TAG_ROWS for x in TAG_COLUMNS)}
 
 
 def tag_distance() -> float:

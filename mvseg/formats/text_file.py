@@ -107,8 +107,7 @@ def escape_text(text: str) -> str:
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
     """Content of a YAML file; a line of OpenCV, "%YAML:1.0", is left out. Raises InputError as `read_text`, or if it is
     not YAML that Python can hold, or uses aliases (nested ones expand 300 bytes into billions of values)."""
-    lines = read_text(path, expected).split("\n")
-    text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
+    text = "\n".join("" if line.startswith("%YAML:") else line for line in read_text(path, expected).split("\n"))
     try:
         depth = 0
         for each in yaml.parse(text, Loader=yaml.SafeLoader):

@@ -144,8 +144,7 @@ def _undo_applied(path: Path, transforms: _Transforms) -> tuple[np.ndarray, floa
 def _photo(folder: Path, frame: _Frame, given: dict[str, Any], *, undo: tuple[np.ndarray, float]) -> Photo:
     intrinsics = _complete(folder, frame, given)
     width, height, fx = intrinsics["w"], intrinsics["h"], intrinsics["fl_x"]
-    fy = intrinsics.get("fl_y", fx)
-    K = np.array([[fx, 0, intrinsics["cx"]], [0, fy, intrinsics["cy"]], [0, 0, 1.0]])
+    K = np.array([[fx, 0, intrinsics["cx"]], [0, intrinsics.get("fl_y", fx), intrinsics["cy"]], [0, 0, 1.0]])
     world_from_cam = np.array(frame.transform_matrix)
     if (np.abs(world_from_cam[3:] - [0, 0, 0, 1]) > ROTATION_TOLERANCE).any():
         raise InputError("the last row of transform_matrix is not 0, 0, 0, 1")

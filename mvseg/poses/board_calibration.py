@@ -183,8 +183,7 @@ def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict
     side /= np.linalg.norm(side)
     axes = np.column_stack([side, np.cross(direction, side), direction])
     cam_from_world = _rigid(Rotation.from_matrix(axes), point)
-    angles = dict(zip(poses, turns.tolist(), strict=True))
-    return cam_from_world, angles, cam_from_world.inverse() * cam_from_board
+    return cam_from_world, dict(zip(poses, turns.tolist(), strict=True)), cam_from_world.inverse() * cam_from_board
 
 
 def _find_axis(poses: Sequence[pycolmap.Rigid3d]) -> tuple[Floats, Floats, Floats]:

@@ -77,7 +77,6 @@ class WorldFacts:
     def __post_init__(self) -> None:
         if len(given := self.scales) > 1:
             raise InputError(f"{' and '.join(given)} both give a scale, expected one of them")
-        lengths = {"marker": self.marker, "distance": self.distance and self.distance[2]}
-        for name, length in lengths.items():
+        for name, length in {"marker": self.marker, "distance": self.distance and self.distance[2]}.items():
             if length is not None and not 0 < length < math.inf:
                 raise InputError(f"{name} is {length:g} long, expected a positive number")

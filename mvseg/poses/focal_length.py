@@ -29,8 +29,7 @@ class FocalLength:
         """The finding of this code where the deviation is above `TABLE.most_sd`, none where it is not."""
         if self.deviation is None or self.deviation <= TABLE.most_sd * self.px:
             return []
-        values = {"px": self.px, "deviation": self.deviation, "share": self.deviation / self.px}
-        return [Finding(code, where, values)]
+        return [Finding(code, where, {"px": self.px, "deviation": self.deviation, "share": self.deviation / self.px})]
 
 
 def least_sure(lengths: Sequence[FocalLength]) -> FocalLength:

@@ -181,8 +181,7 @@ def _too_few(count: int, num_photos: int, least: int, *, plain: Sequence[str], g
     poor = f"; {len(plain)} have hardly any texture, the first is {plain[0]}" if plain else ""
     asked = "--min_registered asks for" if given else "expected at least"
     less = "" if given or count < STRUCTURE.least else f", or --min_registered {count} to accept these"
-    text = f"{count} of {num_photos} photos could be registered, {asked} {least}{poor}"
-    return f"{text}. Next: {NEXT_STEPS}{less}"
+    return f"{count} of {num_photos} photos could be registered, {asked} {least}{poor}. Next: {NEXT_STEPS}{less}"
 
 
 def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolmap.Camera:

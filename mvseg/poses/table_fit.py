@@ -113,8 +113,7 @@ def fit_table(
 
     def residuals(numbers: Floats) -> Floats:
         lenses = numbers[: of_cameras.size].reshape(of_cameras.shape)[:, 1:num_lens]
-        unusual = lenses / USUAL[: lenses.shape[1]]
-        return np.append(_project(*split(numbers), sightings) / noise_px, unusual)
+        return np.append(_project(*split(numbers), sightings) / noise_px, lenses / USUAL[: lenses.shape[1]])
 
     fit = least_squares(residuals, start, x_scale="jac", ftol=tolerance, max_nfev=200)
     adjusted, pose, turned = split(fit.x)

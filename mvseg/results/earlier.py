@@ -12,7 +12,7 @@ import errno
 import json
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -112,8 +112,7 @@ def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[P
         with folder_whole(out, list_replaced) as folder:
             yield folder
             files = {name: hash_files(folder / name) for name in list_files(folder)}
-            said = run | {"output": output.describe(out), "files": files}
-            text = json.dumps(said, indent=1, default=str)
+            text = json.dumps(run | {"output": output.describe(out), "files": files}, indent=1, default=str)
             (folder / output.run_file).write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
@@ -167,8 +166,7 @@ def claim_folder(out: Path, output: Output) -> None:
     """Make a folder for a command that adds files one by one, and say in it whose it is; see `check_out`."""
     out.mkdir(parents=True, exist_ok=True)
     if not (out / output.run_file).is_file():
-        text = json.dumps({"output": output.describe(out)}, indent=1)
-        write_text_whole(out / output.run_file, text + "\n")
+        write_text_whole(out / output.run_file, json.dumps({"output": output.describe(out)}, indent=1) + "\n")
 
 
 def check_file(path: Path, sign: bytes | None) -> None:
@@ -198,7 +196,6 @@ def _try_place(out: Path, place: Path) -> None:
 
 def path_from(out: Path, path: str) -> str | None:
     """A path as seen from a folder; None on another drive of Windows."""
-    try:
+    with suppress(ValueError):
         return Path(os.path.relpath(path, resolve_place(out))).as_posix()
-    except ValueError:
-        return None
+    return None

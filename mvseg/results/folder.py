@@ -72,14 +72,13 @@ def describe_result(result: Result) -> dict[str, Any]:
     """Entries of run.json about the outcome of a run: scene, matching, traits, corrections, counts and timings."""
     report, scene = result.matching.report, result.scene
     shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]
-    taken = [view.name for view in scene.views]
     record: dict[str, Any] = {
         "format": FORMAT,
         "scene": scene.name,
         "unit": scene.unit or None,
         "up": scene.up,
         "photos": str(photos_folder(scene.views[0]).resolve()) if scene.views else None,
-        "views": {"taken": taken, "left_out": list(result.views_left_out)},
+        "views": {"taken": [view.name for view in scene.views], "left_out": list(result.views_left_out)},
         "mask_kind": result.mask_kind or None,
         "matched_by": report.method,
         "residual_px": report.residual_px,
@@ -154,8 +153,7 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
     masks_of_frames = {"segmentation": encode_mask(mask_in_photo(result, region))}
     if result.scene.views[view].lens is not None:
         width, height = result.scene.cameras.sizes[view].tolist()
-        whole = result.regions.mask(region, width, height).cpu().numpy()
-        masks_of_frames["undistorted"] = encode_mask(whole)
+        masks_of_frames["undistorted"] = encode_mask(result.regions.mask(region, width, height).cpu().numpy())
     return {
         "image_id": view + 1,
         "instance_id": instance,

@@ -65,8 +65,7 @@ def write_plant(result: Result, folder: Path) -> None:
     if result.traits is not None:
         write_long(folder / "traits.csv", result.traits)
         write_wide(folder / "traits_wide.csv", result.traits)
-        graph = json.dumps(plant_graph(result.traits), indent=1, allow_nan=False)
-        write_text_whole(folder / GRAPH_FILE, graph + "\n")
+        write_text_whole(folder / GRAPH_FILE, json.dumps(plant_graph(result.traits), indent=1, allow_nan=False) + "\n")
         if result.traits.stems:
             write_nodes(folder / NODES_FILE, result.traits)
 
@@ -85,7 +84,6 @@ def gltf_from_world(scene: Scene) -> NDArray[np.float64]:
 def describe_world(scene: Scene) -> dict[str, Any]:
     """The extras of the node above all leaves: the unit and the up of the meshes' own coordinates, None where unknown,
     and whether the node brings them to glTF's."""
-    is_known = scene.unit.strip().lower() in METRES
     up = None if scene.up is None else list(scene.up)
-    placed = {"is_in_metres": is_known, "is_y_up": up is not None}
+    placed = {"is_in_metres": scene.unit.strip().lower() in METRES, "is_y_up": up is not None}
     return {"plant": scene.name, "unit": scene.unit or None, "up": up, **placed}

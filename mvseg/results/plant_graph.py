@@ -21,12 +21,12 @@ from mvseg.traits.ontology import DEFINITIONS, Kind, unit_of
 GRAPH_FORMAT = "mvseg-plant/1"
 SCALES = {"P": 1, "A": 2, "E": 3, "L": 3}  # definition: scale of each class in the MTG
 OF_NODES: dict[str, Kind] = {"internode": "length", "divergence": "degree", "node_azimuth": "degree"}
+KINDS = {name: each.kind for name, each in DEFINITIONS.items()} | OF_NODES
 
 
 def plant_graph(traits: Traits) -> dict[str, Any]:
     """Content of plant.json. Leaves without a node hang on the plant; instances that are no leaves are left out."""
     leaves = {leaf.leaf: leaf for leaf in traits.leaves if leaf.rejection is None}
-    kinds = {name: each.kind for name, each in DEFINITIONS.items()} | OF_NODES
     on_stems = {node.leaf for stem in traits.stems for node in stem.nodes}
     return {
         "format": GRAPH_FORMAT,
@@ -34,7 +34,7 @@ def plant_graph(traits: Traits) -> dict[str, Any]:
         "mtg_scales": SCALES,
         "plant": traits.plant,
         "unit": traits.unit or None,
-        "units": {name: unit_of(kind, traits.unit) for name, kind in kinds.items()},
+        "units": {name: unit_of(kind, traits.unit) for name, kind in KINDS.items()},
         "up": traits.up,
         **_split_numbers(traits.whole),
         "stems": [_describe_stem(stem, leaves) for stem in traits.stems],

@@ -96,10 +96,14 @@ class _Instances(BaseModel):
     annotations: Items[_Mask]
 
 
-def load_learned(folder: Path, run: RunRecord) -> Learned:
+def read_detector(folder: Path) -> bytes | None:
+    """The weights that learned a plant; None where its result has none."""
     path = folder / DETECTOR_FILE
-    weights = path.read_bytes() if path.is_file() else None
-    return Learned(weights=weights, rounds=run.learned.rounds, agreed_area=run.learned.agreed_area)
+    return path.read_bytes() if path.is_file() else None
+
+
+def load_learned(folder: Path, run: RunRecord) -> Learned:
+    return Learned(read_detector(folder), rounds=run.learned.rounds, agreed_area=run.learned.agreed_area)
 
 
 def find_result(folder: Path) -> Path:
@@ -220,18 +224,10 @@ def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:
             except Exception as error:  # of any kind
                 raise InputError(f"image {image.name}: its lens is none of COLMAP's ({error})") from None
         views.append(View(image.name, photos / image.file_name, lens))
-    return Scene(
-        name=run.scene or folder.name,
-        views=tuple(views),
-        cameras=Cameras(
-            K=_as_tensor([image.camera.K for image in images], 3, 3),
-            R=_as_tensor([image.camera.R for image in images], 3, 3),
-            t=_as_tensor([image.camera.t for image in images], 3),
-            sizes=_as_tensor([(image.width, image.height) for image in images], 2),
-        ),
-        unit=run.unit or "",
-        up=run.up,
-    )
+    K, R = (_as_tensor([getattr(image.camera, name) for image in images], 3, 3) for name in ("K", "R"))
+    t = _as_tensor([image.camera.t for image in images], 3)
+    cameras = Cameras(K=K, R=R, t=t, sizes=_as_tensor([(image.width, image.height) for image in images], 2))
+    return Scene(run.scene or folder.name, tuple(views), cameras, unit=run.unit or "", up=run.up)
 
 
 def _as_tensor(numbers: object, *shape: int) -> Tensor:
@@ -267,14 +263,9 @@ def _decode(mask: _Mask, scene: Scene, view: int) -> Crop:
 
 
 def _report_of(run: RunRecord) -> MatchReport:
-    matching, shares = run.matching, run.matching.view_explained
-    return MatchReport(
-        method=run.matched_by,
-        has_probabilities=matching.has_probabilities,
-        residual_px=run.residual_px,
-        explained=matching.explained,
-        view_explained=None if shares is None else torch.tensor([math.nan if n is None else n for n in shares]),
-    )
+    stated, shares = run.matching.model_dump(include={"has_probabilities", "explained"}), run.matching.view_explained
+    of_views = None if shares is None else torch.tensor([math.nan if n is None else n for n in shares])
+    return MatchReport(run.matched_by, residual_px=run.residual_px, view_explained=of_views, **stated)
 
 
 def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -80,10 +81,9 @@ class RunRecord(_Part):
 
     def list_findings(self) -> tuple[Finding, ...]:
         """The findings of the run; none where another version wrote them in another way."""
-        try:
+        with suppress(KeyError, TypeError, AttributeError, ValueError):
             return tuple(Finding.from_json(each) for each in self.findings)
-        except (KeyError, TypeError, AttributeError, ValueError):
-            return ()
+        return ()
 
     def as_json(self) -> dict[str, Any]:
         return self.model_dump(mode="json", exclude_unset=True)

@@ -110,18 +110,11 @@ def read_voxels(path: Path) -> dict[int, VoxelGrid]:
     try:
         if not (np.isfinite(arrays["origin"]).all() and np.isfinite(arrays["voxel_size"]).all()):
             raise ValueError("a grid lies at no place")
-        return ByInstance(
-            {
-                int(leaf): VoxelGrid(
-                    origin=torch.from_numpy(arrays["origin"][row].copy()),
-                    voxel_size=float(arrays["voxel_size"][row]),
-                    votes=torch.from_numpy(arrays[f"votes_{leaf}"]),
-                    num_views=int(arrays["num_views"][row]),
-                    threshold=float(arrays["threshold"][row]),
-                )
-                for row, leaf in enumerate(arrays["leaf"].tolist())
-            }
-        )
+        grids, columns = {}, [arrays[name] for name in ("leaf", "origin", "voxel_size", "num_views", "threshold")]
+        for leaf, origin, size, num_views, threshold in zip(*columns, strict=True):
+            corner, votes = torch.from_numpy(origin.copy()), torch.from_numpy(arrays[f"votes_{leaf}"])
+            grids[int(leaf)] = VoxelGrid(corner, float(size), votes, int(num_views), float(threshold))
+        return ByInstance(grids)
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no voxels that mvseg wrote ({error})") from None
 

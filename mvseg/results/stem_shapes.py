@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -35,9 +35,11 @@ class StemPart:
 
 
 def parts_of(result: Result) -> list[StemPart]:
-    """The stems and petioles of a result; none without traits."""
+    """The stems and petioles of a result; none without traits. A single stem goes on to leaves below its lower end."""
     stems = () if result.traits is None else result.traits.stems
-    return [part for stem in stems for part in stem_parts(stem)]
+    parts = [part for stem in stems for part in stem_parts(stem)]
+    middles = [each.points().reshape(-1, 3).mean(0).numpy() for each in (result.surfaces or {}).values()]
+    return parts + (continue_below(parts[0], np.array(middles).reshape(-1, 3)) if len(stems) == 1 else [])
 
 
 def stem_parts(stem: Stem) -> Iterator[StemPart]:
@@ -50,3 +52,14 @@ def stem_parts(stem: Stem) -> Iterator[StemPart]:
         if np.linalg.norm(ends[1] - ends[0]) > PETIOLE_WIDTH * length:
             width = np.full(2, PETIOLE_WIDTH * length)
             yield StemPart(f"petiole_{node.leaf:03d}", node.leaf, ends, width, PETIOLE_COLOR)
+
+
+def continue_below(stem: StemPart, middles: NDArray[np.float64]) -> list[StemPart]:
+    """The stem straight on from its lower end, guessed, to the lowest of the middles (N, 3) of leaves; [] where none is
+    below it."""
+    ahead = stem.points[0] - stem.points[min(3, len(stem.points) - 1)]
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-300)
+    beyond = float(((middles - stem.points[0]) @ ahead).max(initial=0))
+    ends = np.array([stem.points[0] + beyond * ahead, stem.points[0]])
+    below = replace(stem, name=f"{stem.name}_below", points=ends, radius=stem.radius[[0, 0]], is_guessed=True)
+    return [below] if beyond > 0 else []

@@ -221,11 +221,10 @@ class Corrector:
                     break
                 self.news.wait(LOOK_SECONDS)
             task, page = self.task, self.page_state
-            computing = task.then if isinstance(task, Learning) else task
             return {
                 "number": self.number,
                 "revision": self.edits.name,
-                "isComputing": isinstance(computing, Computing),
+                "isComputing": isinstance(task.then if isinstance(task, Learning) else task, Computing),
                 "doing": task.doing if isinstance(task, Computing) else "",
                 "isChanged": self.edits.is_changed(),
                 "problem": page.problem,

@@ -82,8 +82,7 @@ class _Handler(BaseHTTPRequestHandler):
         except ConnectionError:
             self.close_connection = True
         except OSError as error:
-            folder = self.server.corrector.opened.folder
-            sentence = f"{folder}: the edit could not be saved ({error.strerror})"
+            sentence = f"{self.server.corrector.opened.folder}: the edit could not be saved ({error.strerror})"
             self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _place(self) -> str:

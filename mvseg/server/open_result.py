@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, Field
 
-from mvseg.corrections.file import Corrections, Point, dump_edits, load_corrections
+from mvseg.corrections.file import Corrections, Point, dump_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.detection.cached_detections import CachedDetections
@@ -36,14 +36,14 @@ from mvseg.pipeline.plant import Plant, match_given
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import name_regions, stack_regions
 from mvseg.results.folder import BEFORE_EDITS_FILE
-from mvseg.results.read import load_result
+from mvseg.results.read import load_result, read_detector
 from mvseg.results.report.correct import describe_fate, measure_angles
 from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.leaf_news import tell_drawn, tell_vanished
-from mvseg.server.saved_edits import CORRECTIONS_FILE, Update
+from mvseg.server.saved_edits import Update, read_saved
 from mvseg.server.stable_numbers import give_numbers
 from mvseg.system.atomic import lock_folder
 from mvseg.system.file_hash import hash_files
@@ -66,15 +66,15 @@ class OpenResult:
         version does not understand; its scene, its masks or its photos are gone."""
         self.folder = folder
         self.run = read_recorded(folder)
-        self._detector = _read_detector(folder)
+        self._detector = read_detector(folder)
         self._changes = [each for each in self.run.changes if each.where != str(self.run.corrections)]
         changes = (as_sentence(each) for each in self._changes)
         self.notice = " ".join(("What you see is computed anew.", *changes)) if self._changes else ""
-        saved = self.saved_corrections()  # the views that they name are taken
         config = self.run.config
         if self._detector is not None:  # it has learned this plant: nobody waits for that again
             config = replace(config, detect=replace(config.detect, weights=str(folder)), learn="off")
-        self.opened = open_scene(self.run.scene, self.run.masks, config, corrections=saved)
+        # the views that edits name are taken
+        self.opened = open_scene(self.run.scene, self.run.masks, config, corrections=read_saved(folder))
         self.scene, self.photos = self.opened.scene, self.opened.photos
         if not self.photos.exist:
             raise InputError(f"{self.scene.views[0].path}: the photos of this result are gone, expected them there")
@@ -92,7 +92,7 @@ class OpenResult:
         return None if self.opened.holds else self
 
     def read_edits(self) -> tuple[Corrections, str]:
-        found = self.saved_corrections()
+        found = read_saved(self.folder)
         with collect_warnings() as noticed:
             check_made_for(found, self.photos)
         return found, " ".join(filter(None, (self.notice, *map(as_sentence, noticed))))
@@ -128,10 +128,6 @@ class OpenResult:
         saved, views = self.saved_result, range(len(self.scene.views))
         return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
 
-    def saved_corrections(self) -> Corrections:
-        path = self.folder / CORRECTIONS_FILE
-        return load_corrections(path) if path.is_file() else Corrections()
-
     @cached_property
     def saved_result(self) -> Result:
         """The result as it lies in the folder, for the page to begin with; without masks where it shows other views, or
@@ -142,8 +138,7 @@ class OpenResult:
                 ids = zip(name_regions(saved.regions), saved.masks.instance_ids.tolist(), strict=True)
                 self._numbers.update({name: number for name, number in ids if number > 0})
                 return replace(saved, scene=self.scene, photos=self.photos)
-        nothing = Masks.of(stack_regions([], len(self.scene.views)))
-        return Result(self.scene, Matching(nothing, MatchReport("none")))
+        return Result(self.scene, Matching(Masks.of(stack_regions([], len(self.scene.views))), MatchReport("none")))
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels, bit for bit that of `mvseg infer --again`:
@@ -182,7 +177,7 @@ class OpenResult:
         in the folder by now; its weights are written into the folder `place`."""
         weights = self._detector if self.learned is None else self.learned[0].learned.weights
         again = ["infer", "--again", str(self.folder.resolve())]
-        if weights == _read_detector(self.folder):
+        if weights == read_detector(self.folder):
             return again
         if weights is None:
             return [*again, "--learn", "off"]
@@ -242,11 +237,6 @@ class OpenResult:
 def as_sentence(finding: Finding) -> str:
     text = str(finding)
     return f"{text[:1].upper()}{text[1:]}" + ("" if text.endswith("?") else ".")
-
-
-def _read_detector(folder: Path) -> bytes | None:
-    path = folder / DETECTOR_FILE
-    return path.read_bytes() if path.is_file() else None
 
 
 def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | None = None) -> Result:

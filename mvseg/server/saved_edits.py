@@ -35,6 +35,12 @@ class Refused(Exception):
         self.status = status
 
 
+def read_saved(folder: Path) -> Corrections:
+    """The edits saved in a folder; none where there is no file."""
+    path = folder / CORRECTIONS_FILE
+    return load_corrections(path) if path.is_file() else Corrections()
+
+
 class SavedEdits:
     """The newest edits of a folder. Not safe for threads: the owner locks. `notice` is for the user, or ""."""
 
@@ -78,7 +84,7 @@ class SavedEdits:
         if stamp in (None, self._stamp):
             return False
         try:
-            found = self._read_file()
+            found = read_saved(self.path.parent)
         except InputError:
             return True
         if name_edits(found.edits) != self.name:
@@ -112,15 +118,11 @@ class SavedEdits:
         """Write the newest edits after the folder was made anew, where the file holds earlier ones of this page,
         whoever put them back; but never over those of another program."""
         with suppress(InputError):  # theirs, and broken: `is_changed` says so
-            if name_edits(self._read_file().edits) in self._own:
+            if name_edits(read_saved(self.path.parent).edits) in self._own:
                 self.write()
 
     def _find_stamp(self) -> tuple[int, int] | None:
-        try:
+        with suppress(OSError):
             about = self.path.stat()
-        except OSError:
-            return None
-        return about.st_mtime_ns, about.st_size
-
-    def _read_file(self) -> Corrections:
-        return load_corrections(self.path) if self.path.is_file() else Corrections()
+            return about.st_mtime_ns, about.st_size
+        return None

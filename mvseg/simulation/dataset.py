@@ -94,9 +94,7 @@ def list_specs(preset: Preset, seed: int) -> list[SceneSpec]:
                 plant_seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
                 for num_views in preset.views:
                     name = f"{split}/{family}-{index:03d}_leaves-{num_leaves:02d}_views-{num_views:02d}"
-                    spec = SceneSpec(folder=name, split=split, family=family, num_leaves=num_leaves,
-                                     num_views=num_views, seed=plant_seed)  # fmt: skip
-                    scenes.append(spec)
+                    scenes.append(SceneSpec(name, split, family, num_leaves, num_views, plant_seed))
     return scenes
 
 

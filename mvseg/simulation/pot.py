@@ -45,8 +45,7 @@ def lift(pot: Pot, points: Floats) -> Floats:
     """The points (P, 3) with those below the soil, the rim or the ground lifted smoothly above it."""
     outside = np.clip((np.linalg.norm(points[:, :2], axis=1) - pot.radius - 6) / 40, 0, 1)
     floor = 4 - pot.height * outside**2 * (3 - 2 * outside)
-    z = floor + 2 * np.logaddexp(0, (points[:, 2] - floor) / 2)
-    return np.concatenate([points[:, :2], z[:, None]], 1)
+    return np.column_stack([points[:, :2], floor + 2 * np.logaddexp(0, (points[:, 2] - floor) / 2)])
 
 
 def pot_parts(pot: Pot, rng: np.random.Generator) -> list[Part]:

@@ -22,7 +22,7 @@ from mvseg.scene import Cameras
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant
 from mvseg.simulation.look import Floats, Look, draw_look, draw_wild_look
-from mvseg.simulation.shading import GROUND, MATERIALS, Hits, backdrop_color, develop, dot, shade, unit
+from mvseg.simulation.shading import GROUND, LEAF, MATERIALS, Hits, backdrop_color, develop, dot, shade, unit
 
 Doubles = NDArray[np.float64]
 
@@ -97,8 +97,7 @@ def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
     borders = np.flatnonzero(find_boundaries(ids.astype(np.int32) * (len(MATERIALS) + 1) + kinds))
     quarters = [(dx, dy) for dx in (-0.25, 0.25) for dy in (-0.25, 0.25)]
     color[borders] = sum(look(centres[borders] + shift)[0] for shift in quarters) / 4
-    rgb = develop(color.reshape(height, width, 3), stage.look, rng)
-    return Rendering(rgb, ids, depth.reshape(height, width))
+    return Rendering(develop(color.reshape(height, width, 3), stage.look, rng), ids, depth.reshape(height, width))
 
 
 def trace_rays(
@@ -160,8 +159,7 @@ def build_stage(plant: SimulatedPlant, *, seed: int) -> Stage:
 
 def merge_meshes(plant: SimulatedPlant) -> Mesh:
     """The leaves, and after them the parts, as one mesh."""
-    leaf_material = MATERIALS.index("leaf")
-    meshes = [(leaf.vertices, leaf.faces, leaf_material, leaf.leaf_id, leaf.dryness) for leaf in plant.leaves]
+    meshes = [(leaf.vertices, leaf.faces, LEAF, leaf.leaf_id, leaf.dryness) for leaf in plant.leaves]
     meshes += [(part.vertices, part.faces, MATERIALS.index(part.material), 0, 0.0) for part in plant.parts]
     counts = [len(mesh[1]) for mesh in meshes]
     starts = np.cumsum([0] + [len(mesh[0]) for mesh in meshes])

@@ -168,8 +168,7 @@ def plan_plant(spec: SeriesSpec) -> GrowingPlant:
         foot, tilt = place_foot(family, rng, azimuth=start + index * GOLDEN_ANGLE, is_first=index == 0)
         levels = math.ceil(len(share) / family.per_node)
         shoots.append((foot, foot.scale * rng.uniform(*family.internode, levels), tilt))
-    seats = _seat_fronds(spec, counts, shoots, rng)
-    return _uncrowd(GrowingPlant(spec, pot, tuple(shoots), tuple(seats)))
+    return _uncrowd(GrowingPlant(spec, pot, tuple(shoots), tuple(_seat_fronds(spec, counts, shoots, rng))))
 
 
 def _seat_fronds(
@@ -191,10 +190,7 @@ def _seat_fronds(
         yellows = rng.uniform(-0.5 * YELLOWING, max(span - YELLOWING, 0.1)) if falls else math.inf
         azimuth = turns[shoot] + math.radians(family.divergence * level + 360 * place / family.per_node)
         scale, ids = shoots[shoot][0].scale * rng.uniform(0.8, 1.1), tuple(range(first_id, first_id + count))
-        seats.append(
-            _Seat(shoot=shoot, level=level, ids=ids, born=born, yellows=yellows, azimuth=azimuth, scale=scale,
-                  seed=(spec.seed, rank, 0))
-        )  # fmt: skip
+        seats.append(_Seat(shoot, level, ids, born, yellows, azimuth, scale, seed=(spec.seed, rank, 0)))
         first_id += count
     return seats
 

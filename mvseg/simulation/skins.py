@@ -83,8 +83,7 @@ def dress(look: Look, skins: tuple[Floats, ...], rng: np.random.Generator) -> Lo
         return _recolored(replace(look, skin=skin), wanted, rng)
     if kind == "hue":
         hue = rng.choice([rng.uniform(0.12, 0.45), rng.uniform(0.9, 1.1) % 1, rng.uniform(0.75, 0.95)])
-        color = hue_color(hue, rng.uniform(0.2, 0.9), 0.03 * 8 ** rng.uniform(0, 1))
-        return _recolored(look, color, rng)
+        return _recolored(look, hue_color(hue, rng.uniform(0.2, 0.9), 0.03 * 8 ** rng.uniform(0, 1)), rng)
     if kind == "marking":
         hue = rng.choice([rng.uniform(0.1, 0.2), rng.uniform(0.2, 0.35), rng.uniform(0.9, 1.1) % 1])
         marking = Marking(

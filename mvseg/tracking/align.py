@@ -180,8 +180,7 @@ def refine_alignment(pair: Pair, pose: Floats) -> Alignment:
         links = pair.link_costs[now.pairs[:, 0], now.pairs[:, 1]]
         # what the pairs weigh as if nobody had said that they are one leaf
         weights = np.maximum(links - now.costs, np.where(links < 0, ALIGN.least_weight, 0.0))
-        fitted = _fit(pair, now.pairs, weights, start=now.pose[:3, :3])
-        before, now = now.pairs, align_at(pair, fitted)
+        before, now = now.pairs, align_at(pair, _fit(pair, now.pairs, weights, start=now.pose[:3, :3]))
     return now
 
 

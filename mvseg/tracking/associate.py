@@ -108,8 +108,7 @@ def join_observations(gains: Floats, date_of: np.ndarray) -> np.ndarray:
 
 def _rejoin(tracks: np.ndarray, gains: Floats, apart: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
     """Cut the tracks in two, `apart` (S,) and the rest, and join the parts for the largest gain."""
-    rest = ~apart if among is None else among & ~apart
-    here, there, table = _part_gains(tracks, gains, rest, apart)
+    here, there, table = _part_gains(tracks, gains, ~apart if among is None else among & ~apart, apart)
     rows, columns = linear_sum_assignment(np.maximum(table, 0.0), maximize=True)
     is_better = table[rows, columns] > 0
     names = tracks.max(initial=0) + 1 + np.arange(len(there))

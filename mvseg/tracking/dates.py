@@ -18,12 +18,13 @@ from mvseg.errors import InputError, collect_warnings
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
 from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.results.plant_graph import KINDS, OF_NODES
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
 from mvseg.tracking.numbers import OBSERVATIONS
 from mvseg.tracking.pictures import LeafPicture, draw_pictures
 from mvseg.traits.leaf import Measurement
-from mvseg.traits.ontology import DEFINITIONS, unit_of
+from mvseg.traits.ontology import unit_of
 from mvseg.traits.up import level_frame
 
 NUMBER = re.compile(r"[+-]?(0|[1-9]\d*|(?=\.\d))(\.\d*)?([eE][+-]?\d+)?")  # 0428 and 2026_04_28 are none
@@ -131,25 +132,21 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     frame, leaves = level_frame(traits.up) if traits.up is not None and traits.up_from == "scene" else None, []
 
     def numbers_of(measured: Mapping[str, Measurement]) -> dict[str, Number]:
-        units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in measured}
+        units = {name: unit_of(KINDS[name], traits.unit) for name in measured}
         return {name: Number(m.value, m.sd, units[name]) for name, m in measured.items() if m.exists}
 
     nodes = {node.leaf: (stem.number, node) for stem in traits.stems for node in stem.nodes}
     for leaf in traits.leaves:
         if leaf.rejection is None or leaf.rejection == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
-            observation = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
-            if leaf.leaf in nodes:
-                stem, node = nodes[leaf.leaf]
-                units = {"internode": traits.unit, "divergence": "degree", "node_azimuth": "degree"}
-                measured = {name: getattr(node, name) for name in units}
-                numbers = {name: Number(m.value, m.sd, units[name]) for name, m in measured.items() if m.exists}
-                observation = replace(observation, numbers={**observation.numbers, **numbers}, node=(stem, node.number))
-            leaves.append(replace(observation, is_doubted=leaf.rejection is not None))
+            stem, node = nodes.get(leaf.leaf, (0, None))
+            of_node = {} if node is None else {name: getattr(node, name) for name in OF_NODES}
+            observation = _see_leaf(leaf.leaf, shape, numbers_of({**leaf.numbers, **of_node}), frame)
+            place = None if node is None else (stem, node.number)
+            leaves.append(replace(observation, is_doubted=leaf.rejection is not None, node=place))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
-        knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole),
-        up_from=traits.up_from,
+        knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole), up_from=traits.up_from,
     )  # fmt: skip
 
 

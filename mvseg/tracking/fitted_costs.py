@@ -158,8 +158,7 @@ def bend(pair: Pair, pairs: np.ndarray) -> tuple[DateLeaves, Floats]:
     median = float(np.median(np.linalg.norm(errors[:, :2], axis=1))) / COSTS.usual
     spread = (prior + len(rows) * median**2) / (prior + len(rows))
     moved = shifts[:, None] * pair.scale
-    bent = replace(first, midribs=first.midribs + moved, points=first.points + moved)
-    return bent, np.sqrt(spread * (1 + variances))
+    return replace(first, midribs=first.midribs + moved, points=first.points + moved), np.sqrt(spread * (1 + variances))
 
 
 def costs_of(apart: Differences, scales: Scales) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 
 from mvseg.arrays import Floats
 from mvseg.tracking.dates import Number
-from mvseg.tracking.track import Tracks
+from mvseg.tracking.track import Tracks, list_observations
 
 TRAITS = (
     "area", "length", "width", "inclination", "curvature", "insertion_height", "node_height", "internode",
@@ -75,15 +75,12 @@ def measure_growth(tracks: Tracks) -> Growth:
     different stems, and for internodes above different leaves.
     """
     numbers = [{leaf.leaf: leaf.numbers for leaf in date.leaves} for date in tracks.dates]
-    dates_of: dict[int, list[tuple[int, int]]] = {}
-    for row in tracks.rows:
-        if row.leaf is not None:
-            dates_of.setdefault(row.track, []).append((row.date, row.leaf))
+    observations_of = sorted(list_observations(tracks).items())
     points: list[GrowthPoint] = []
     for trait in TRAITS:
         by_track = {
-            track: {date: numbers[date][leaf][trait] for date, leaf in observations if trait in numbers[date][leaf]}
-            for track, observations in sorted(dates_of.items())
+            track: {date: numbers[date][leaf][trait] for (date, leaf), _ in own if trait in numbers[date][leaf]}
+            for track, own in observations_of
         }
         origins = find_origins(tracks, trait)
         if trait in HEIGHTS:
@@ -141,8 +138,7 @@ def _with_one_origin(
         dates = [date for date, each in enumerate(tracks.roots) if each == root]
         keys = {origins[date, track] for track, numbers in by_track.items() for date in numbers if date in dates}
         whole = [track for track, numbers in by_track.items() if numbers.keys() >= set(dates)]
-        axes = {date for date in dates if tracks.dates[date].up_from == "stem"}
-        if len(keys) < 2 or not whole or axes:
+        if len(keys) < 2 or not whole or any(tracks.dates[date].up_from == "stem" for date in dates):
             continue
         reference = min(whole, key=lambda track: np.mean([by_track[track][date].value for date in dates]))
         for track, numbers in by_track.items():
@@ -171,17 +167,13 @@ def _plant_rows(tracks: Tracks, points: Sequence[GrowthPoint]) -> Iterator[Plant
             areas.setdefault(point.date, {})[point.track] = point.number
     states, total_born = Counter((row.date, row.state) for row in tracks.rows), 0
     for index, date in enumerate(tracks.dates):
-        total_born += states[index, "born"]
+        born, gone = states[index, "born"], states[index, "gone"]
+        total_born += born
+        phyllochron = (date.time - tracks.dates[0].time) / total_born if total_born else math.nan
         days = date.time - tracks.dates[max(index - 1, 0)].time
-        yield PlantRow(
-            date=index,
-            leaves=len(date.leaves),
-            born=states[index, "born"],
-            gone=states[index, "gone"],
-            phyllochron=(date.time - tracks.dates[0].time) / total_born if total_born else math.nan,
-            total_area=date.whole.get("total_leaf_area", NOTHING),
-            relative_growth_rate=_relative_growth(areas.get(index - 1, {}), areas.get(index, {}), days),
-        )
+        growth = _relative_growth(areas.get(index - 1, {}), areas.get(index, {}), days)
+        area = date.whole.get("total_leaf_area", NOTHING)
+        yield PlantRow(index, len(date.leaves), born, gone, phyllochron, area, relative_growth_rate=growth)
 
 
 def _relative_growth(before: Mapping[int, Number], now: Mapping[int, Number], days: float) -> Number:

@@ -47,9 +47,8 @@ def draw_pictures(result: Result, leaves: Collection[int], *, side: int) -> tupl
         photo = _photo(about.path, labels[view].shape) if shown else None
         for leaf in shown:
             mask = labels[view] == leaf
-            jpeg = cut_picture(photo, mask, side=side)
             (column, row), _ = find_thickest(mask.astype(np.uint8))
-            pictures[leaf] = LeafPicture(jpeg, about.name, (column + 0.5, row + 0.5))
+            pictures[leaf] = LeafPicture(cut_picture(photo, mask, side=side), about.name, (column + 0.5, row + 0.5))
     whole = max(range(len(labels)), key=lambda view: np.mean(labels[view] > 0))
     if not labels[whole].any():
         return pictures, b""

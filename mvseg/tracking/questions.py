@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from mvseg.corrections.track_links import LeafLink
 from mvseg.tracking.dates import NUMBER
 from mvseg.tracking.numbers import ALIGN, PAGE
-from mvseg.tracking.track import Tracks
+from mvseg.tracking.track import Tracks, list_observations
 
 Observation = tuple[int, int]  # index of the date, id of the leaf in its result
 
@@ -33,8 +33,7 @@ class Question:
 
     def link(self, tracks: Tracks, *, is_same: bool) -> LeafLink:
         """The user's answer."""
-        leaves = tuple((tracks.dates[date].scene, leaf) for date, leaf in (self.before, self.after))
-        return LeafLink(is_same, leaves)
+        return LeafLink(is_same, tuple((tracks.dates[date].scene, leaf) for date, leaf in (self.before, self.after)))
 
 
 def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Question]:
@@ -52,14 +51,14 @@ def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Quest
 
 
 def _of_links(tracks: Tracks) -> Iterator[Question]:
-    for observations in _observations(tracks).values():
+    for observations in list_observations(tracks).values():
         for (before, _), (after, chance) in pairwise(observations):
             yield Question(before, after, True, round(1 - chance, 6))
 
 
 def _of_ends(tracks: Tracks) -> Iterator[Question]:
     shaped = [{date.leaves[place].leaf: row for row, place in enumerate(date.shaped)} for date in tracks.dates]
-    observations = list(_observations(tracks).values())
+    observations = list(list_observations(tracks).values())
     for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in observations for two in observations):
         chances = tracks.chances.get((earlier, later))
         if chances is not None and leaf in shaped[earlier] and other in shaped[later]:
@@ -70,7 +69,7 @@ def _of_ends(tracks: Tracks) -> Iterator[Question]:
 def describe_changes(now: Tracks, then: Tracks) -> list[str]:
     """Describe the differences of other tracks of the same plant, a sentence each; leaves are called as they are
     now."""
-    names = {leaf: track for track, observations in _observations(now).items() for leaf, _ in observations}
+    names = {leaf: track for track, observations in list_observations(now).items() for leaf, _ in observations}
     before, after = _earlier_observations(now), _earlier_observations(then)
     changes = []
     for observation in sorted(before.keys() | after.keys()):
@@ -96,15 +95,6 @@ def _name_day(tracks: Tracks, date: int) -> str:
     return f"day {written}" if NUMBER.fullmatch(written) else written
 
 
-def _observations(tracks: Tracks) -> dict[int, list[tuple[Observation, float]]]:
-    """{track: its leaves in the order of time, each with the probability of its link to the one before}."""
-    observations: dict[int, list[tuple[Observation, float]]] = {}
-    for row in tracks.rows:
-        if row.leaf is not None:
-            observations.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
-    return observations
-
-
 def _earlier_observations(tracks: Tracks) -> dict[Observation, Observation]:
-    every = (pairwise(observations) for observations in _observations(tracks).values())
+    every = (pairwise(observations) for observations in list_observations(tracks).values())
     return {after: before for pairs in every for (before, _), (after, _) in pairs}

@@ -77,6 +77,15 @@ class Tracks:
         return max((row.track for row in self.rows), default=0)
 
 
+def list_observations(tracks: Tracks) -> dict[int, list[tuple[tuple[int, int], float]]]:
+    """{track: (date, leaf) in the order of time, each with the probability of its link to the one before}."""
+    observations: dict[int, list[tuple[tuple[int, int], float]]] = {}
+    for row in tracks.rows:
+        if row.leaf is not None:
+            observations.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
+    return observations
+
+
 def track_leaves(
     results: Sequence[Path | str | Result | PlantOnDate],
     times: Sequence[float | str] | None = None,
@@ -121,11 +130,9 @@ def track_leaves(
     if believed != dates:
         dates = believed
         compared, associations = _link_dates(dates, links, pots)
-    return Tracks(
-        plant=plant, dates=dates, rows=_rank_tracks(_rows(dates, associations, compared.roots), dates, compared),
-        poses=compared.poses, roots=tuple(compared.roots.tolist()),
-        findings=tuple(_find_doubts(dates, compared)), chances=pairwise_chances(compared),
-    )  # fmt: skip
+    rows = _rank_tracks(_rows(dates, associations, compared.roots), dates, compared)
+    roots, findings = tuple(compared.roots.tolist()), tuple(_find_doubts(dates, compared))
+    return Tracks(plant, dates, rows, compared.poses, roots, findings, chances=pairwise_chances(compared))
 
 
 def _link_dates(
@@ -136,8 +143,7 @@ def _link_dates(
     same, different = _observations_of(links, dates)
     times, counts = [date.time for date in dates], [len(each) for each in leaves]
     compared = compare_dates(leaves, times, knows_up=knows_up, pots=pots, same=same, different=different)
-    linked = link_leaves(counts, compared.costs, same=same, different=different)
-    return compared, sum_over_poses(linked, compared)
+    return compared, sum_over_poses(link_leaves(counts, compared.costs, same=same, different=different), compared)
 
 
 def _without_stems(

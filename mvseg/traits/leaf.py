@@ -171,8 +171,7 @@ class _Angle:
             if sine <= PARALLEL * size:
                 across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
             across = across / np.linalg.norm(across)
-        angle = np.degrees(np.arctan2(sine, end @ ahead)) if size > 0 else np.nan
-        return _Angle(ahead, across, float(angle))
+        return _Angle(ahead, across, float(np.degrees(np.arctan2(sine, end @ ahead))) if size > 0 else np.nan)
 
     def between(self, start: Floats, end: Floats) -> Floats:
         """(M,) degrees between M pairs of directions (M, 3), or one (3,), within half a turn of the leaf as fitted."""

@@ -194,8 +194,8 @@ def measure_plant(
         plant_stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=photos, of_masks=of_masks)
         plant_stems = judge_stems(plant_stems, stem_marks, scene.cameras)
     tilt_deg = 0.0
-    if frame is None and (up := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
-        frame, tilt_deg = level_frame(up), TILT_DEG
+    if frame is None and (upward := up_of_stem(plant_stems, blades, scene.cameras)) is not None:
+        frame, tilt_deg = level_frame(upward), TILT_DEG
     ground = extent = 0.0  # heights start from the lowest point of all blades
     if frame is not None and blades:
         points = np.concatenate([surface.points().numpy().reshape(-1, 3) for surface in blades.values()]) @ frame.T
@@ -218,26 +218,14 @@ def measure_plant(
         fitted = None if surfaces is None else surfaces.get(instance, NO_MASKS)
         if fitted is not None and fitted.exists and instance not in blades and instance not in rejected:
             numbers["area"] = measure_area(fitted)
-        leaf = describe_leaf(
-            instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance), unit=scene.unit
-        )
-        leaves.append(replace(leaf, probability=probabilities.get(instance)))
-    whole = measure_whole(
-        blades,
-        frame,
-        num_leaves=len(instances) - len(rejected),
-        useless=[leaf.leaf for leaf in leaves if leaf.leaf in blades and leaf.use == "no"],
-    )
+        leaf = describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejected.get(instance))
+        leaves.append(replace(leaf, unit=scene.unit, probability=probabilities.get(instance)))
+    useless = [leaf.leaf for leaf in leaves if leaf.leaf in blades and leaf.use == "no"]
+    whole = measure_whole(blades, frame, num_leaves=len(instances) - len(rejected), useless=useless)
     x, y, z = (0.0, 0.0, 0.0) if frame is None else map(float, frame[2])
-    return Traits(
-        plant=scene.name,
-        unit=scene.unit,
-        leaves=tuple(leaves),
-        whole=tilt(whole, tilt_deg, extent=extent),
-        up=None if frame is None else scene.up or (x, y, z),
-        up_from="" if frame is None else "scene" if scene.up is not None else "stem",
-        stems=plant_stems,
-    )
+    up, whole = None if frame is None else scene.up or (x, y, z), tilt(whole, tilt_deg, extent=extent)
+    up_from: UpFrom = "" if frame is None else "scene" if scene.up is not None else "stem"
+    return Traits(scene.name, scene.unit, tuple(leaves), whole, up, stems=plant_stems, up_from=up_from)
 
 
 def tilt(numbers: Mapping[str, Measurement], degrees: float, *, extent: float) -> dict[str, Measurement]:
@@ -258,7 +246,6 @@ def describe_leaf(
     *,
     fitted: LeafSurface | None,
     rejection: Rejection | None,
-    unit: str,
 ) -> LeafTraits:
     """The leaf with all of its traits, from the `numbers` that were measured; those that are missing with the reason.
     `shape` stands for it; `fitted` is its surface, credible or not, None where no surfaces were asked for; `rejection`
@@ -284,4 +271,4 @@ def describe_leaf(
         of_trait["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     kind = None if rejection is None else rejection.kind
-    return LeafTraits(leaf=instance, numbers=of_trait, method=method, reasons=reasons, rejection=kind, unit=unit)
+    return LeafTraits(leaf=instance, numbers=of_trait, method=method, reasons=reasons, rejection=kind)

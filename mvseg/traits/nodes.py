@@ -165,29 +165,18 @@ def measure_stem(
         height = Measurement(float(middle[node] - foot), float(np.hypot(sd[node], start_sd)), source)
         x, y, z = (float(np.interp(middle[node], reach, each)) for each in curve.T)
         bx, by, bz = leaves.bases[rank].tolist()
-        nodes.append(
-            Node(
-                number=node + 1,
-                leaves_per_node=int(counts[node]),
-                rank=rank + 1,
-                leaf=int(leaves.ids[rank]),
-                place=(x, y, z),
-                base=(bx, by, bz),
-                height=height if height.value >= 0 else BELOW,
-                internode=internode,
-                divergence=divergence,
-                insertion_angle=Measurement(float(leaves.rising[rank]), float(leaves.rising_sd[rank]), source),
-                node_azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
-            )
-        )
+        numbers = {"height": height if height.value >= 0 else BELOW, "internode": internode, "divergence": divergence}
+        numbers["insertion_angle"] = Measurement(float(leaves.rising[rank]), float(leaves.rising_sd[rank]), source)
+        numbers["node_azimuth"] = turned if turned.sd <= VAGUE_DEG else VAGUE
+        leaf = int(leaves.ids[rank])
+        nodes.append(Node(node + 1, int(counts[node]), rank + 1, leaf, (x, y, z), (bx, by, bz), **numbers))
     return replace(bare, nodes=tuple(nodes), phyllotaxis=phyllotaxis)
 
 
 def _place_leaves(axis: StemAxis, bases: LeafBases, frame: Floats | None) -> _Places:
     curve, reach = axis.extend(), axis.extended_reach
     places, misses, along = project_bases(bases, curve)
-    slopes = np.gradient(curve, reach, axis=0)
-    tangents = np.stack([np.interp(along, reach, each) for each in slopes.T], 1)
+    tangents = np.stack([np.interp(along, reach, each) for each in np.gradient(curve, reach, axis=0).T], 1)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
     on_axis = np.stack([np.interp(along, reach, each) for each in curve.T], 1)
     petiole = np.linalg.norm(bases.points - places, axis=1)
@@ -204,16 +193,11 @@ def _place_leaves(axis: StemAxis, bases: LeafBases, frame: Floats | None) -> _Pl
         bases.point_sd**2 + (petiole * turn_sd) ** 2 + np.minimum(axis_sd / np.abs(slant), petiole + axis_sd) ** 2
         + (MISS_SHARE * misses) ** 2
     )  # fmt: skip
-    leaves = _Places(
-        ids=bases.ids,
-        along=along,
-        along_sd=np.maximum(along_sd, 1e-9 * axis.length),
-        bases=bases.points,
-        azimuth=np.degrees(np.arctan2((across * north).sum(1), (across * east).sum(1))),
-        azimuth_sd=np.hypot(np.degrees(sideways), BLADE_SD_DEG),
-        rising=rising,
-        rising_sd=np.hypot(np.degrees(turn_sd), ARCH_SD_DEG),
-    )
+    along_sd = np.maximum(along_sd, 1e-9 * axis.length)
+    azimuth = np.degrees(np.arctan2((across * north).sum(1), (across * east).sum(1)))
+    azimuth_sd = np.hypot(np.degrees(sideways), BLADE_SD_DEG)
+    rising_sd = np.hypot(np.degrees(turn_sd), ARCH_SD_DEG)
+    leaves = _Places(bases.ids, along, along_sd, bases.points, azimuth, azimuth_sd, rising, rising_sd)
     order = np.lexsort((bases.ids, along))
     order = order[(along[order] > 0) & (along[order] < reach[-1])]  # others would join it where the curve is cut
     return leaves.select(order)

@@ -27,11 +27,7 @@ FROM_SURFACES = [trait.name for trait in PLANT_TRAITS[1:]]
 
 
 def measure_whole(
-    surfaces: Mapping[int, LeafSurface],
-    frame: Floats | None,
-    *,
-    num_leaves: int,
-    useless: Collection[int] = (),
+    surfaces: Mapping[int, LeafSurface], frame: Floats | None, *, num_leaves: int, useless: Collection[int] = ()
 ) -> dict[str, Measurement]:
     """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id. `frame` has the (3, 3) rows east,
     north, up, None where up is not known; `num_leaves` counts leaves without a surface, too. The total area is without
@@ -80,8 +76,7 @@ def _measure_surfaces(
 def measure_together(coefficients: Tensor, up: Floats | None) -> Tensor:
     """(2,) area and volume of the hull of leaves whose patches have the coefficients (N, 26, 3); (3,) with the height
     where up is known."""
-    basis = torch.from_numpy(patch_grid(*MESH_SHAPE).basis)
-    points = (basis @ coefficients).unflatten(1, MESH_SHAPE)
+    points = (torch.from_numpy(patch_grid(*MESH_SHAPE).basis) @ coefficients).unflatten(1, MESH_SHAPE)
     diagonal = points[:, 1:, 1:] - points[:, :-1, :-1]
     sides = (points[:, 1:, :-1] - points[:, :-1, :-1], points[:, :-1, 1:] - points[:, :-1, :-1])
     lower, upper = torch.linalg.cross(sides[0], diagonal), torch.linalg.cross(diagonal, sides[1])

@@ -310,13 +310,6 @@ def petiole_bases(path: StemPath, surfaces: Mapping[int, LeafSurface]) -> LeafBa
         starts.append(way[0])
         ahead.append(direction / max(float(np.linalg.norm(direction)), 1e-300))
         near.append(way[0] + direction)
-    num = len(ids)
-    return LeafBases(
-        ids=np.array(ids, np.int64),
-        points=np.array(starts).reshape(num, 3),
-        ahead=np.array(ahead).reshape(num, 3),
-        near=np.array(near).reshape(num, 3),
-        lengths=np.array([surfaces[leaf].length for leaf in ids]),
-        point_sd=np.full(num, path.cell),
-        angle_sd=np.zeros(num),
-    )
+    points, directions, beside = (np.array(each).reshape(-1, 3) for each in (starts, ahead, near))
+    lengths, point_sd = np.array([surfaces[leaf].length for leaf in ids]), np.full(len(ids), path.cell)
+    return LeafBases(np.array(ids, np.int64), points, directions, beside, lengths, point_sd, np.zeros(len(ids)))

@@ -126,15 +126,10 @@ def _read_leaf(
     codes = row["doubts"].split("; ") if "doubts" in row else texts  # an older version has none
     # where there are no voxels, and in tables of older versions, some have no row
     numbers = dict.fromkeys(VOXEL_NAMES, missing("has no voxels")) | numbers
-    return LeafTraits(
-        leaf=leaf,
-        numbers={trait.name: numbers.get(trait.name, missing("of an older version")) for trait in LEAF_TRAITS},
-        method=row["method"],
-        reasons=dict(zip(codes, texts, strict=False)),
-        rejection=rejection,
-        unit=unit,
-        probability=float(row["probability"]) if row.get("probability") else None,
-    )
+    of_trait = {trait.name: numbers.get(trait.name, missing("of an older version")) for trait in LEAF_TRAITS}
+    reasons, chance = dict(zip(codes, texts, strict=False)), row.get("probability")
+    probability = float(chance) if chance else None
+    return LeafTraits(leaf, of_trait, row["method"], reasons, rejection, unit=unit, probability=probability)
 
 
 def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:

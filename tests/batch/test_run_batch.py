@@ -141,8 +141,6 @@ def test_a_batch_is_resumed(here: None, plants: Path, tmp_path: Path, capsys: py
     assert capsys.readouterr().out == f"{out}: 3 of 3 scenes are done (2 of them before)\n"
     assert read_table(out / "tables" / "failures.csv") == []
     assert (out / "tables" / "notes.txt").read_text() == "a good night"
-    assert main(arguments(plants, out, "--quiet", "--resume", "true", "--match.seed", "5")) == 0
-    assert capsys.readouterr().out == f"{out}: 3 of 3 scenes are done\n"
 
 
 def test_parts_of_a_batch_share_its_folder(

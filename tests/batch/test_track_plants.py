@@ -102,7 +102,7 @@ def test_each_result_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_all_plants_of_a_batch(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mvseg.batch.workers.run_locally", run_here)
+    monkeypatch.setattr("mvseg.batch.track_plants.run_locally", run_here)
     rows = [("a0", "a", "0"), ("b0", "b", "0"), ("a1", "a", "1"), ("b1", "b", ""), ("c0", "c", "0")]
     batch = write_batch(tmp_path / "batch", rows)
     assert main(["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--num_workers", "2"]) == 3

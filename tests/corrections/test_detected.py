@@ -21,7 +21,7 @@ from mvseg.findings.finding import Finding
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
-from mvseg.pipeline.before_edits import MOST_BYTES, pack_plant, unpack_plant
+from mvseg.pipeline.before_edits import pack_plant, unpack_plant
 from mvseg.pipeline.find_in_photos import find_in_photos
 from mvseg.pipeline.plant import SOURCES, Plant
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -78,7 +78,8 @@ def as_painted(state: Plant) -> list[np.ndarray]:
     return [masks.regions.label_map(view, leaves, tuple(CAMERAS.sizes[view].tolist())).numpy() for view in range(6)]
 
 
-def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -> None:
+def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read(monkeypatch: Any) -> None:
+    monkeypatch.setattr("mvseg.pipeline.before_edits.MOST_BYTES", most := 2**22)
     opened, reject = open_photos(SCENE), Corrections((Reject(view="v0", at=at(WEAK, 0), everywhere=True),))
     approach = Approach(LEAVES[1].views, LEAVES[1].coefficients, LEAVES[1].offsets_px, spread=0.5)
     opened.cache.update({"name": LEAVES[1], "one": approach, "other": None, "edge": REGIONS.crop(0)})
@@ -107,11 +108,10 @@ def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -
     assert unpack_plant(content, fewer) is None
     code = io.BytesIO()
     torch.save({"views": opened.names, "plant": run}, code)
-    bomb = zlib.compress(bytes(MOST_BYTES + 1) + content)
+    bomb = zlib.compress(bytes(most + 1) + content)
     packed_twice = io.BytesIO()
     with zipfile.ZipFile(packed_twice, "w", zipfile.ZIP_DEFLATED) as inner, inner.open("archive/data.pkl", "w") as file:
-        for _ in range(MOST_BYTES // 2**20 + 1):
-            file.write(bytes(2**20))
+        file.write(bytes(most + 1))
     bombs = bomb, zlib.compress(packed_twice.getvalue())
     for broken in (*bombs, b"", content[:-9], zlib.compress(b"text"), zlib.compress(code.getvalue())):
         assert unpack_plant(broken, opened) is None

@@ -156,7 +156,7 @@ def test_masks_are_cut_and_low_scores_discarded(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_boxes_that_the_other_views_do_not_confirm_are_discarded(monkeypatch: pytest.MonkeyPatch) -> None:
-    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(2), small_cameras(2)
 
     def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, **options: object) -> torch.Tensor:
         return torch.arange(len(boxes)) > 0
@@ -320,7 +320,7 @@ def test_both_doors_find_the_same_leaves() -> None:
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
-    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=40), some_images(), small_cameras()
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=15), some_images(), small_cameras()
     masks = wrapped.find_regions(iter(images), cameras).masks
     results = wrapped(images, cameras=cameras)
     views = masks.view_index

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -50,13 +51,16 @@ def pan(places: np.ndarray, *, sharp_every: int = 1) -> list[np.ndarray]:
     return [f if k % sharp_every == 0 else cv2.GaussianBlur(f, (0, 0), 4) for k, f in enumerate(frames)]
 
 
+watch_once = cache(watch)
+
+
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_clip(tmp_path_factory.mktemp("clip") / "walk.mp4", pan(PLACES, sharp_every=3))
 
 
 def test_motion_and_sharpness_are_measured(walk: Path) -> None:
-    footage = watch(walk)
+    footage = watch_once(walk)
     assert footage.frames.tolist() == list(range(len(PLACES)))
     np.testing.assert_allclose(footage.motion * WIDTH, PLACES, atol=0.04 * PLACES[-1])
     assert (np.diff(footage.motion) >= 0).all()
@@ -65,7 +69,7 @@ def test_motion_and_sharpness_are_measured(walk: Path) -> None:
 
 
 def test_frames_are_sharp_and_spread_by_motion(walk: Path, tmp_path: Path) -> None:
-    names = write_frames(walk, tmp_path / "frames", choose_frames(watch(walk), most=60))
+    names = write_frames(walk, tmp_path / "frames", choose_frames(watch_once(walk), most=60))
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == names
     numbers = np.array([int(name[len("frame-") : -len(".jpg")]) for name in names])
     assert (np.diff(numbers) > 0).all()
@@ -185,7 +189,7 @@ def test_a_name_that_begins_as_a_protocol_does(walk: Path, tmp_path: Path, monke
     name = f"2026-05-01T10:30{walk.suffix}"
     shutil.copy(walk, tmp_path / name)
     monkeypatch.chdir(tmp_path)
-    assert len(watch(Path(name)).frames) == len(watch(walk).frames)
+    assert len(watch(Path(name)).frames) == len(watch_once(walk).frames)
 
 
 def test_videos_are_files_with_their_suffixes(walk: Path, tmp_path: Path) -> None:

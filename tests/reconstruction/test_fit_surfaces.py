@@ -279,7 +279,7 @@ def test_as_many_ids_as_regions() -> None:
         fit_surfaces(regions, ids[:9], CAMERAS)
 
 
-@pytest.mark.parametrize(("elevation_deg", "arc_deg"), [(60, 360), (50, 360), (45, 144)])
+@pytest.mark.parametrize(("elevation_deg", "arc_deg"), [(60, 360), (45, 144)])
 def test_cameras_that_all_look_down_show_a_level_leaf(elevation_deg: float, arc_deg: float) -> None:
     """Its hull is as thick as it is wide: only the fit tells that the leaf does not stand upright."""
     cameras = ring_cameras(8, elevations_deg=(elevation_deg,), arc_deg=arc_deg)
@@ -293,10 +293,9 @@ def test_leaves_that_are_searched_side_by_side_are_those_of_each_alone(
     is_rough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Slow twin: one after the other, to the bit. Their crops are of different sizes, and one has fewer masks."""
-    cameras = CAMERAS[[0, 2, 4, 6, 8]]
+    cameras = CAMERAS[[0, 2, 5, 7]]
     leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),
-              2: flat_leaf(length=0.8, half_width=0.35, at=(-0.6, 0.1, 0.0)),
-              3: flat_leaf(length=1.1, half_width=0.2, at=(-0.2, 0.5, 0.1))}  # fmt: skip
+              2: flat_leaf(length=0.8, half_width=0.35, at=(-0.6, 0.1, 0.0))}  # fmt: skip
     maps = [paint_view(leaves, cameras, view) for view in range(len(cameras))]
     maps[1][maps[1] == 2] = 0
     regions, ids = as_regions(maps)

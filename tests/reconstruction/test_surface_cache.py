@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -35,8 +36,13 @@ def are_same(one: LeafSurface, other: LeafSurface) -> bool:
     return all(same) and one.is_oriented == other.is_oriented and one.quality == other.quality
 
 
-def fit(cache: Cache | None, ids: Tensor, **how: bool) -> dict[int, LeafSurface]:
-    return fit_surfaces(REGIONS, ids, FEW, cache=cache, **how)
+def fit(cached: Cache, ids: Tensor, **how: bool) -> dict[int, LeafSurface]:
+    return fit_surfaces(REGIONS, ids, FEW, cache=cached, **how)
+
+
+@cache
+def fit_alone(ids: tuple[int, ...], **how: bool) -> dict[int, LeafSurface]:
+    return fit_surfaces(REGIONS, torch.tensor(ids), FEW, **how)
 
 
 @pytest.mark.parametrize("is_rough", [False, True])
@@ -45,10 +51,10 @@ def test_what_was_fitted_before_changes_no_bit(is_rough: bool) -> None:
     moved = IDS.clone()
     moved[(IDS == 3).nonzero()[0, 0]] = -1
     tables = [IDS, without_first, moved, IDS]
-    fresh = [fit(None, ids, is_rough=is_rough) for ids in tables]
-    cache: Cache = {}
-    for ids, expected in zip(tables, fresh, strict=True):
-        found = fit(cache, ids, is_rough=is_rough)
+    cached: Cache = {}
+    for ids in tables:
+        found = fit(cached, ids, is_rough=is_rough)
+        expected = fit_alone(tuple(ids.tolist()), is_rough=is_rough)
         assert list(found) == list(expected)
         assert all(are_same(found[each], expected[each]) for each in found)
 
@@ -56,26 +62,26 @@ def test_what_was_fitted_before_changes_no_bit(is_rough: bool) -> None:
 def test_a_leaf_is_fitted_again_only_where_something_that_it_follows_from_changed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    cache, asked = {}, []
+    cached, asked = {}, []
     first, again = fitting._fit_first, fitting._fit_again
     monkeypatch.setattr(fitting, "_fit_first", lambda each: (asked.extend(["first"] * len(each)), first(each))[1])
     monkeypatch.setattr(fitting, "_fit_again", lambda each: (asked.extend(["again"] * len(each)), again(each))[1])
-    whole = fit(cache, IDS)
+    whole = fit(cached, IDS)
     assert asked == ["first"] * 3 + ["again"] * 3
     asked.clear()
-    renumbered = fit(cache, IDS + 4)
+    renumbered = fit(cached, IDS + 4)
     assert all(renumbered[each + 4] is whole[each] for each in whole)
     assert asked == []
-    fit_surfaces(REGIONS, IDS.where(IDS != 3, -1), FEW, same_segmenter=whole, cache=cache)
+    fit_surfaces(REGIONS, IDS.where(IDS != 3, -1), FEW, same_segmenter=whole, cache=cached)
     assert asked == []  # the third leaf hides none of the others, and how masks err is known
-    fit_surfaces(REGIONS, IDS.where(IDS != 1, -1), FEW, same_segmenter=whole, cache=cache)
+    fit_surfaces(REGIONS, IDS.where(IDS != 1, -1), FEW, same_segmenter=whole, cache=cached)
     assert asked == ["again"]  # the masks that hid the second leaf are still there, the surface is not
     asked.clear()
-    fit_surfaces(REGIONS, IDS, FEW[[0, 1, 3, 2]], cache=cache)
+    fit_surfaces(REGIONS, IDS, FEW[[0, 1, 3, 2]], cache=cached)
     assert asked.count("first") == 3
     asked.clear()
     monkeypatch.setattr(numbers, "FIT", replace(numbers.FIT, num_steps=numbers.FIT.num_steps + 1))
-    fit(cache, IDS)
+    fit(cached, IDS)
     assert asked.count("first") == 3
 
 
@@ -92,6 +98,6 @@ def test_only_leaves_that_are_near_can_hide_one() -> None:
 
 
 def test_the_order_of_ids_does_not_matter() -> None:
-    whole, other = fit(None, IDS), fit(None, 4 - IDS)
+    whole, other = fit_alone(tuple(IDS.tolist()), is_rough=False), fit({}, 4 - IDS)
     for each in whole:
         assert torch.equal(whole[each].coefficients, other[4 - each].coefficients)

@@ -7,7 +7,7 @@ import pytest
 
 from known_leaves import bent_blade, move, turn_about
 from mvseg.reconstruction.stem.leaf_bases import axes_of_bases
-from mvseg.results.stem_shapes import PETIOLE_COLOR, STEM_COLOR, stem_parts
+from mvseg.results.stem_shapes import PETIOLE_COLOR, STEM_COLOR, continue_below, stem_parts
 from mvseg.traits.nodes import Stem, measure_stem
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -36,6 +36,9 @@ def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -
     short = replace(stem, axis=replace(stem.axis, points=stem.axis.points[10:20], radius=stem.axis.radius[10:20]))
     whole = next(stem_parts(short))  # no leaf floats beyond its ends
     assert [whole.points[0, 2], whole.points[-1, 2]] == [height.min(), height.max()]
+    (below,) = continue_below(whole, whole.points[[0, -1]] - [30.0, 0, 7.0])  # the middles of two leaves
+    assert (below.is_guessed, whole.points[0, 2] - below.points[0, 2]) == (True, pytest.approx(7, abs=0.5))
+    assert not continue_below(whole, whole.points)
     for part in (whole, trunk, *petioles):
         assert part.mesh().is_watertight
         assert part.mesh().volume > 0

@@ -50,15 +50,13 @@ def check_meshes(plant: SimulatedPlant) -> None:
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_grows_sound_plants(family: str) -> None:
     """Meshes are sound, blades seldom cut through each other, and plants have the size of plants."""
-    plants = [grow_plant(family, 32, seed) for seed in range(2)]
-    for plant in (*plants, grow_plant(family, 1, seed=3)):
-        assert [leaf.leaf_id for leaf in plant.leaves] == list(range(1, len(plant.leaves) + 1))
-        check_meshes(plant)
-    assert [len(plant.leaves) for plant in plants] == [32, 32]
-    assert np.mean([share_of_crossing_leaves(plant) for plant in plants]) < 0.12
-    tops = [max(leaf.vertices[:, 2].max() for leaf in plant.leaves) for plant in plants]
-    assert min(tops) > 20
-    assert max(tops) < 900
+    plant = grow_plant(family, 32, seed=0)
+    for each in (plant, grow_plant(family, 1, seed=3)):
+        assert [leaf.leaf_id for leaf in each.leaves] == list(range(1, len(each.leaves) + 1))
+        check_meshes(each)
+    assert len(plant.leaves) == 32
+    assert share_of_crossing_leaves(plant) < 0.12
+    assert 20 < max(leaf.vertices[:, 2].max() for leaf in plant.leaves) < 900
 
 
 def test_leggy_stems_are_bare() -> None:

@@ -321,7 +321,7 @@ def test_cameras_on_one_side_are_said() -> None:
 @pytest.mark.parametrize("half_widths", [(0.45, 0.4), (0.08, 0.1)])
 def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> None:
     """Unless all leaves are as slender: a strap is no stem."""
-    cameras, apart = ring_cameras(10), torch.tensor([0.0, 1.1, 0.0], dtype=torch.float64)
+    cameras, apart = ring_cameras(6), torch.tensor([0.0, 1.1, 0.0], dtype=torch.float64)
     masks = [
         blade_masks(EllipticBlade(half_width=width, bend=0.9), replace(cameras, t=cameras.t + side * cameras.R @ apart))
         for width, side in zip(half_widths, (-1, 1), strict=True)

@@ -51,9 +51,8 @@ def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regi
 
     def contents() -> Iterator[ViewMasks]:
         for index, view in enumerate(views):
-            size = None if scene is None else tuple(scene.cameras.sizes[index].tolist())
             with faults_of(f"view {index}"):
-                content = _read(view, size)
+                content = _read(view, None if scene is None else tuple(scene.cameras.sizes[index].tolist()))
             yield content
 
     return stack_views(contents(), scene, num_views=len(views), source="masks in memory")

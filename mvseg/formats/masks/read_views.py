@@ -40,8 +40,7 @@ def read_views(scene: Scene, files: MaskFiles, *, wanted: Collection[str]) -> It
         try:
             content = read_photo_masks(paths, files.kind, scene.cameras.sizes[view].tolist())
         except InputError as error:
-            turn = describe_turn(scene.views[view].path)
-            raise InputError(f"{error} (view {view}{turn})") from None
+            raise InputError(f"{error} (view {view}{describe_turn(scene.views[view].path)})") from None
         if isinstance(content, np.ndarray):
             with faults_of(f"{paths[0]} (view {view})"):
                 num_borders += ignore_border(content)
@@ -76,6 +75,5 @@ def read_photo_masks(paths: Sequence[Path], kind: str, size: Sequence[int]) -> n
         advice = "in cellpose, save the masks as PNG or TIFF (File menu, or --save_png)"
         raise InputError(f"{paths[0]}: is a pickle, which may run anything when it is read; {advice}")
     if kind in ("YOLO", YOLO_TRACKS):
-        names = read_class_names(paths[0].parent)
-        return read_yolo(paths[0], width, height, names=names, tracks=kind == YOLO_TRACKS)
+        return read_yolo(paths[0], width, height, names=read_class_names(paths[0].parent), tracks=kind == YOLO_TRACKS)
     return read_mask_images(paths, width, height)

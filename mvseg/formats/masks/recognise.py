@@ -5,6 +5,7 @@ from __future__ import annotations
 import filecmp
 import re
 from collections import defaultdict
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,10 +110,9 @@ def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
 
 
 def _is_copy(path: Path, photo: Path) -> bool:
-    try:
+    with suppress(OSError):  # not readable: the reader will say so
         return filecmp.cmp(path, photo, shallow=False)
-    except OSError:  # not readable: the reader will say so
-        return False
+    return False
 
 
 def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:

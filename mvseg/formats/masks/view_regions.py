@@ -98,8 +98,7 @@ def _without_copies(regions: Regions, *, source: object) -> Regions:
         if not is_copy[one] and shared >= SAME * (areas[one] + areas[other] - shared):
             is_copy[other] = True
     if is_copy.any():
-        values = {"count": int(is_copy.sum()), "total": len(regions), "iou": SAME}
-        warn(Finding("copies", str(source), values))
+        warn(Finding("copies", str(source), {"count": int(is_copy.sum()), "total": len(regions), "iou": SAME}))
     return regions.select(~is_copy)
 
 

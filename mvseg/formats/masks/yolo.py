@@ -8,6 +8,7 @@ of the two folders above (ultralytics and Roboflow: `data.yaml`, `train/labels/`
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -37,10 +38,9 @@ def has_tracks(paths: Iterable[Path]) -> bool:
 
 
 def _is_track(confidence: str, number: str) -> bool:
-    try:
+    with suppress(ValueError):
         return 0 <= float(confidence) <= 1 and number.isdecimal() and int(number) >= 1
-    except ValueError:
-        return False
+    return False
 
 
 def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str], tracks: bool = False) -> list[FoundMask]:

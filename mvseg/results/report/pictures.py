@@ -72,13 +72,9 @@ def draw_picture(photo: np.ndarray, masks: Masks, *, view: int, is_whole: bool =
     box = x1, y1, x2, y2 = (0, 0, width, height) if is_whole else find_plant(masks, view=view, size=(width, height))
     proportion = (y2 - y1) / (x2 - x1)
     wide = min(x2 - x1, picture_width(masks.regions.num_views, proportion))
-    return Picture(
-        jpeg=_shrink(photo[y1:y2, x1:x2], wide),
-        thumbnail=_shrink(photo, min(width, THUMBNAIL_WIDTH)),
-        box=(x1 / width, y1 / height, x2 / width, y2 / height),
-        proportion=proportion,
-        outlines=outline_masks(masks, view=view, box=box),
-    )
+    jpeg, thumbnail = _shrink(photo[y1:y2, x1:x2], wide), _shrink(photo, min(width, THUMBNAIL_WIDTH))
+    shares = (x1 / width, y1 / height, x2 / width, y2 / height)
+    return Picture(jpeg, thumbnail, shares, proportion, outlines=outline_masks(masks, view=view, box=box))
 
 
 def picture_width(num_views: int, proportion: float) -> int:

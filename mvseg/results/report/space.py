@@ -117,10 +117,9 @@ def describe_cameras(cameras: Cameras, frame: Frame) -> list[dict[str, Any]]:
     described = []
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         corners = torch.tensor([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], dtype=torch.float64)
-        rays = (corners @ cameras.world_from_px[view].T).numpy()
         described.append({
             "center": _rounded(centers[view]),
-            "corners": [_rounded(ray) for ray in frame.turn(rays)],
+            "corners": [_rounded(ray) for ray in frame.turn((corners @ cameras.world_from_px[view].T).numpy())],
             "up": _rounded(frame.turn(-cameras.R[view, 1].numpy())),
             "ahead": _rounded(frame.turn(cameras.R[view, 2].numpy())),
         })  # fmt: skip
