@@ -16,7 +16,8 @@ from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.reconstruction.spread_views import find_repeated
-from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
+from mvseg.server.open_result import OpenResult
+from mvseg.server.saved_edits import CORRECTIONS_FILE
 from scene_folders import write_scene
 from warned import warns_of
 

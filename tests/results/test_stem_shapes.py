@@ -40,8 +40,7 @@ def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -
     assert (below.is_guessed, whole.points[0, 2] - below.points[0, 2]) == (True, pytest.approx(7, abs=0.5))
     assert not continue_below(whole, whole.points)
     for part in (whole, trunk, *petioles):
-        assert part.mesh().is_watertight
-        assert part.mesh().volume > 0
+        assert part.mesh().is_volume
 
 
 def test_a_radius_that_is_known_is_drawn(stem: Stem) -> None:
