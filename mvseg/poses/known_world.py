@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -64,10 +62,15 @@ def place(scene: Scene, world: WorldFacts) -> Placement:
     """The similarity that transforms a scene into the known world; without a length the scene stays as it is. Warns
     (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line. Raises
     InputError if the markers or photos named are not seen, or the positions do not fit the photos or are mirrored."""
-    if not world.scales:
-        return Placement(similarity=scale_by(1.0), unit=world.unit)
-    (name,) = world.scales  # one at most, see `WorldFacts`
-    return PLACED_BY[name](scene, getattr(world, name), world.unit)
+    if world.board is not None:
+        return _by_board(scene, world.board, world.unit)
+    if world.marker is not None:
+        return _by_markers(scene, world.marker, world.unit)
+    if world.distance is not None:
+        return _by_distance(scene, world.distance, world.unit)
+    if world.positions is not None:
+        return _by_positions(scene, world.positions, world.unit)
+    return Placement(similarity=scale_by(1.0), unit=world.unit)
 
 
 def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:
@@ -168,7 +171,8 @@ def _spot(scene: Scene, name: str, places: list[tuple[str, Floats]]) -> Floats:
 
 def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     names, xyz, stated = read_positions(path)
-    used = [(index, view) for index, view in enumerate(find_views(names, scene, source=path)) if view is not None]
+    views = find_views(names, scene, source=path)
+    used = [(index, view) for index, view in enumerate(views) if view is not None]
     if len(used) < 2:
         found = f"{len(used)} of its photos are registered ({list_some(names)})"
         raise InputError(f"{path}: {found}, expected three or more")
@@ -207,8 +211,3 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     warn(Finding("positions_on_a_line", str(path)))
     source = f"{len(target)} positions on one line of {path.name}"
     return Placement(similarity=scale_by(float(np.median(ratios))), unit=unit, source=source)
-
-
-PLACED_BY: dict[str, Callable[[Scene, Any, str], Placement]] = {
-    "board": _by_board, "marker": _by_markers, "distance": _by_distance, "positions": _by_positions
-}  # fmt: skip

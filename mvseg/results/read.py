@@ -263,9 +263,14 @@ def _decode(mask: _Mask, scene: Scene, view: int) -> Crop:
 
 
 def _report_of(run: RunRecord) -> MatchReport:
-    stated, shares = run.matching.model_dump(include={"has_probabilities", "explained"}), run.matching.view_explained
-    of_views = None if shares is None else torch.tensor([math.nan if n is None else n for n in shares])
-    return MatchReport(run.matched_by, residual_px=run.residual_px, view_explained=of_views, **stated)
+    matching, shares = run.matching, run.matching.view_explained
+    return MatchReport(
+        method=run.matched_by,
+        has_probabilities=matching.has_probabilities,
+        residual_px=run.residual_px,
+        explained=matching.explained,
+        view_explained=None if shares is None else torch.tensor([math.nan if n is None else n for n in shares]),
+    )
 
 
 def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:

@@ -165,11 +165,21 @@ def measure_stem(
         height = Measurement(float(middle[node] - foot), float(np.hypot(sd[node], start_sd)), source)
         x, y, z = (float(np.interp(middle[node], reach, each)) for each in curve.T)
         bx, by, bz = leaves.bases[rank].tolist()
-        numbers = {"height": height if height.value >= 0 else BELOW, "internode": internode, "divergence": divergence}
-        numbers["insertion_angle"] = Measurement(float(leaves.rising[rank]), float(leaves.rising_sd[rank]), source)
-        numbers["node_azimuth"] = turned if turned.sd <= VAGUE_DEG else VAGUE
-        leaf = int(leaves.ids[rank])
-        nodes.append(Node(node + 1, int(counts[node]), rank + 1, leaf, (x, y, z), (bx, by, bz), **numbers))
+        nodes.append(
+            Node(
+                number=node + 1,
+                leaves_per_node=int(counts[node]),
+                rank=rank + 1,
+                leaf=int(leaves.ids[rank]),
+                place=(x, y, z),
+                base=(bx, by, bz),
+                height=height if height.value >= 0 else BELOW,
+                internode=internode,
+                divergence=divergence,
+                insertion_angle=Measurement(float(leaves.rising[rank]), float(leaves.rising_sd[rank]), source),
+                node_azimuth=turned if turned.sd <= VAGUE_DEG else VAGUE,
+            )
+        )
     return replace(bare, nodes=tuple(nodes), phyllotaxis=phyllotaxis)
 
 
