@@ -85,7 +85,7 @@ def learn(
 
 def _count_rounds(plant: Plant) -> int:
     """Number of rounds to try. With "auto", none where the detector knows the species: most leaves score well, and its
-    own size is the best one. That views hardly agree is no reason: known plants that were taught for it lost."""
+    own size is the best one. That views hardly agree is no reason: a dense plant that was taught for it lost."""
     opened = plant.opened
     if opened.holds or opened.config.learn == "off":
         return 0
