@@ -91,8 +91,7 @@ def _count_rounds(plant: Plant) -> int:
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    is_known = is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not _is_smaller(plant)
-    return 0 if is_known else ROUNDS
+    return 0 if is_familiar(plant.masks, sure_score=DETECTION.sure_score) and not _is_smaller(plant) else ROUNDS
 
 
 def _is_smaller(plant: Plant) -> bool:
@@ -100,8 +99,7 @@ def _is_smaller(plant: Plant) -> bool:
     _, description = read_weights(weights_path(detect.weights))
     if detect.image_size is not None or description is None:
         return False
-    own = min(description.image_size, plant.longest_side)
-    return plant.image_size < own * (1 + DETECTION.size_step) / 2  # rounded sizes are a pixel less
+    return plant.image_size < min(description.image_size, plant.longest_side) * (1 + DETECTION.size_step) / 2
 
 
 def _learn_once(plant: Plant, labels: ViewLabels, cache: CachedDetections) -> Plant:

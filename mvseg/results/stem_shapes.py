@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,11 +35,14 @@ class StemPart:
 
 
 def parts_of(result: Result) -> list[StemPart]:
-    """The stems and petioles of a result; none without traits. A single stem goes on to leaves below its lower end."""
+    """The stems and petioles of a result. A single stem that no mask shows goes on to lower leaves without a node."""
     stems = () if result.traits is None else result.traits.stems
     parts = [part for stem in stems for part in stem_parts(stem)]
-    middles = [each.points().reshape(-1, 3).mean(0).numpy() for each in (result.surfaces or {}).values()]
-    return parts + (continue_below(parts[0], np.array(middles).reshape(-1, 3)) if len(stems) == 1 else [])
+    surfaces = result.surfaces or {}
+    if len(stems) == 1 and stems[0].source != "masks":
+        others = sorted(surfaces.keys() - {node.leaf for node in stems[0].nodes})
+        parts += continue_below(parts[0], [surfaces[leaf].points().reshape(-1, 3).mean(0).numpy() for leaf in others])
+    return parts
 
 
 def stem_parts(stem: Stem) -> Iterator[StemPart]:
@@ -54,12 +57,10 @@ def stem_parts(stem: Stem) -> Iterator[StemPart]:
             yield StemPart(f"petiole_{node.leaf:03d}", node.leaf, ends, width, PETIOLE_COLOR)
 
 
-def continue_below(stem: StemPart, middles: NDArray[np.float64]) -> list[StemPart]:
-    """The stem straight on from its lower end, guessed, to the lowest of the middles (N, 3) of leaves; [] where none is
-    below it."""
+def continue_below(stem: StemPart, middles: Sequence[NDArray[np.float64]]) -> list[StemPart]:
+    """The stem straight on from its lower end, guessed, to the lowest middle (3,) of a leaf; [] where none is lower."""
     ahead = stem.points[0] - stem.points[min(3, len(stem.points) - 1)]
-    ahead /= max(float(np.linalg.norm(ahead)), 1e-300)
-    beyond = float(((middles - stem.points[0]) @ ahead).max(initial=0))
+    beyond = max([0.0, *((each - stem.points[0]) @ ahead / max(ahead @ ahead, 1e-300) for each in middles)])
     ends = np.array([stem.points[0] + beyond * ahead, stem.points[0]])
     below = replace(stem, name=f"{stem.name}_below", points=ends, radius=stem.radius[[0, 0]], is_guessed=True)
     return [below] if beyond > 0 else []

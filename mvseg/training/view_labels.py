@@ -22,8 +22,9 @@ from mvseg.crop import Box
 from mvseg.evaluation.labelled_photo import LabelledPhoto, mask_photo
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks, Origin
+from mvseg.verification.leaf_color import has_leaf_color
 from mvseg.verification.numbers import CHOICE
-from mvseg.verification.picture import OTHER, ViewPicture, colors_of_leaves
+from mvseg.verification.picture import colors_of_leaves
 
 LIKELY = 0.5  # definition: P of a leaf that is learned: it is likelier a leaf than not
 
@@ -59,9 +60,9 @@ class ViewLabels:
         x1, y1, x2, y2 = box
         part = torch.from_numpy(photo[y1:y2, x1:x2].copy()).permute(2, 0, 1)
         small = v2.functional.resize(part, list(size), antialias=True).permute(1, 2, 0).contiguous().numpy()
-        doubtful = ViewPicture.of(self.doubtful, lambda _: photo, view).rows[y1:y2, x1:x2] >= 0
-        covered = np.where(_scale(torch.from_numpy(doubtful), size), 0, -1).astype(np.int32)
-        ignore = ViewPicture(small, covered, step=1).show(self.colors) != OTHER
+        doubtful = self.doubtful.regions
+        covered = doubtful.label_map(view, torch.ones_like(doubtful.view_index), (photo.shape[1], photo.shape[0])) > 0
+        ignore = has_leaf_color(small, self.colors) | _scale(covered[y1:y2, x1:x2], size)
         rows = (self.leaves.view_index == view).nonzero()[:, 0].tolist()
         shown = [_scale(self.leaves.regions.placed(row).within(box).pixels, size) for row in rows]
         masks = [mask for mask in shown if mask.any()]

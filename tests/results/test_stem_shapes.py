@@ -36,9 +36,9 @@ def test_a_stem_and_its_petioles_are_tubes_with_names_of_their_own(stem: Stem) -
     short = replace(stem, axis=replace(stem.axis, points=stem.axis.points[10:20], radius=stem.axis.radius[10:20]))
     whole = next(stem_parts(short))  # no leaf floats beyond its ends
     assert [whole.points[0, 2], whole.points[-1, 2]] == [height.min(), height.max()]
-    (below,) = continue_below(whole, whole.points[[0, -1]] - [30.0, 0, 7.0])  # the middles of two leaves
+    (below,) = continue_below(whole, [*(whole.points[[0, -1]] - [30.0, 0, 7.0])])  # the middles of two leaves
     assert (below.is_guessed, whole.points[0, 2] - below.points[0, 2]) == (True, pytest.approx(7, abs=0.5))
-    assert not continue_below(whole, whole.points)
+    assert not continue_below(whole, [*whole.points])
     for part in (whole, trunk, *petioles):
         assert part.mesh().is_volume
 
