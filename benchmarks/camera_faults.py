@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, nearest_point
 
 # "rotated 5": every camera turned by noise of 5 pixels; "moved 5": shifted by it; "shifted 1": the cameras of the next
 # photo, those of the first for the last; "swapped": those of two photos; "mirrored": in the reverse order.
@@ -51,14 +50,6 @@ def rotate_cameras(cameras: Cameras, px: float, rng: np.random.Generator) -> Cam
 
 def move_cameras(cameras: Cameras, px: float, rng: np.random.Generator) -> Cameras:
     """Every camera shifted along each of its axes, so that what all look at moves by about `px` pixels."""
-    distance = np.linalg.norm(cameras.centers.numpy() - look_at_point(cameras), axis=1)
-    shift = rng.normal(0, 1, (len(cameras), 3)) * (px * distance / cameras.K[:, 0, 0].numpy())[:, None]
+    distance = (cameras.centers - nearest_point(cameras.centers, cameras.R[:, 2])).norm(dim=1)
+    shift = rng.normal(0, 1, (len(cameras), 3)) * (px * distance / cameras.K[:, 0, 0]).numpy()[:, None]
     return replace(cameras, t=cameras.t + torch.from_numpy(shift))
-
-
-def look_at_point(cameras: Cameras) -> NDArray[np.float64]:
-    """(3,) the world point nearest to all optical axes."""
-    axes, centers = cameras.R[:, 2].numpy(), cameras.centers.numpy()
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = across.sum(0) + 1e-9 * np.eye(3)
-    return np.linalg.solve(total, (across @ centers[:, :, None]).sum(0)[:, 0])

@@ -10,7 +10,6 @@ the folders with `masks/` and `truth/`.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -21,12 +20,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from benchmarks.choice import true_maps
 from benchmarks.confidence import has_right_id
-from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps, visible_ids
-from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
+from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
+from benchmarks.straps import FIRST_SEED, draw_straps
+from benchmarks.straps import list_masks as list_straps
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
@@ -34,9 +32,8 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.simulation.growth import grow_plant
 from mvseg.verification.choose import Judges, choose_leaves, find_again
 
 KINDS_HERE = (*KINDS, "pieces")
@@ -48,7 +45,6 @@ class Given:
     """Masks of one scene: D regions and (D,) the leaf that each shows."""
 
     name: str
-    plant: str
     regions: Regions
     leaf: Tensor
     cameras: Cameras
@@ -59,8 +55,7 @@ def read_given(folder: Path) -> Given:
     scene = load_scene(folder)
     regions = load_masks(scene, folder / "masks")
     leaf = true_instances(regions, true_maps(folder, scene))
-    word = folder.parent.name if folder.parent.name.endswith("-series") else folder.name
-    return Given(folder.name, word.split("-")[0], regions, leaf, scene.cameras)
+    return Given(folder.name, regions, leaf, scene.cameras)
 
 
 def choose_given(matched: Masks, cameras: Cameras) -> Masks:
@@ -79,17 +74,12 @@ def list_masks(args: argparse.Namespace) -> Iterator[Given]:
                 maps_of = load_maps(spec, args.cache)
                 regions, leaf = maps_of.masks(kind)
                 name = f"{kind} {spec.num_leaves}x{spec.num_views} {spec.family}"
-                yield Given(name, str(spec.seed), regions, leaf, maps_of.cameras)
+                yield Given(name, regions, leaf, maps_of.cameras)
             continue
         for num_leaves in STRAPS:
             for number in range(args.plants):
-                plant = grow_plant("strap", num_leaves, FIRST_SEED + number)
-                cameras = strap_cameras(plant)
-                true = visible_ids(plant, cameras)
-                regions = regions_from_label_maps([cut_pieces(labels) for labels in true])
-                leaf = true_instances(regions, list(true), count_background=False)
-                name = f"pieces {num_leaves}x{len(cameras)} {number}"
-                yield Given(name, name, regions, leaf, cameras)
+                true, cameras = draw_straps(num_leaves, FIRST_SEED + number)
+                yield Given(f"pieces {num_leaves}x{len(cameras)} {number}", *list_straps(true)["pieces"], cameras)
 
 
 def main() -> None:

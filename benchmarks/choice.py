@@ -14,7 +14,6 @@ chosen, before and after `snap_masks`; its ceilings (before it), the best propos
 from __future__ import annotations
 
 import argparse
-import sys
 import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -24,8 +23,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.special import expit
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mvseg.config import RunConfig
 from mvseg.detection.numbers import DETECTION

@@ -1,7 +1,7 @@
-"""Are match scores probabilities, and are wrong poses noticed? `python benchmarks/confidence.py --cache ~/mvseg-cells`
+"""Are match scores probabilities, and are wrong poses noticed? `python -m benchmarks.confidence --cache ~/mvseg-cells`
 
-The scenes are those of `label_maps` with at most `--most_masks` true masks; true and degraded masks, and those that the
-shipped detector finds. Each is matched with exact poses and with `--draws` of the faults of `camera_faults`, drawn at
+The scenes are those of `label_maps` with at most `MOST_MASKS` true masks; true and degraded masks, and those that the
+shipped detector finds. Each is matched with exact poses and with `DRAWS` of the faults of `camera_faults`, drawn at
 random. The id of a region is right when its cluster is the largest one of its leaf, and its leaf is the most frequent
 one of its cluster; detections that show no leaf do not count.
 
@@ -17,7 +17,6 @@ one of its cluster; detections that show no leaf do not count.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -28,12 +27,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 from torch import Tensor
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from benchmarks.camera_faults import FAULTS, faulty_cameras
+from benchmarks.choice import regress
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_detected, load_maps
 from mvseg.errors import collect_warnings
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -52,6 +49,7 @@ from mvseg.system.worker_pool import run_all
 KINDS = ("true", "degraded", "detected")
 EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.01)
 NUM_BINS = 10  # of the calibration error
+MOST_MASKS, DRAWS = 100, 4  # leaves times views of a scene; faults of its cameras
 SPOILT, LOSS = 0.8, 0.1  # ARI below which, and loss of ARI from which, poses spoil the ids
 
 
@@ -86,7 +84,7 @@ def has_right_id(ids: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return (ids >= 0) & (counts.argmax(1)[ids] == truth) & (counts.argmax(0)[truth] == ids)
 
 
-def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> list[Outcome]:
+def run_scene(spec: SceneSpec, *, cache: Path, is_fit: bool) -> list[Outcome]:
     """All kinds of masks of one scene, each with exact poses first."""
     torch.set_num_threads(1)
     scene, outcomes = load_maps(spec, cache), []
@@ -97,7 +95,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> 
         else:
             regions, truth = scene.masks(kind)
         rng = np.random.default_rng([spec.seed, spec.num_views, number])
-        drawn = [FAULTS[index] for index in rng.choice(len(FAULTS), num_draws, replace=False)]
+        drawn = [FAULTS[index] for index in rng.choice(len(FAULTS), DRAWS, replace=False)]
         for fault in ("exact", *drawn):
             cameras = faulty_cameras(scene.cameras, fault, rng)
             outcomes.append(judge(regions, truth, cameras, kind=kind, fault=fault, is_fit=is_fit))
@@ -135,19 +133,6 @@ def clusters_and_features(regions: Regions, cameras: Cameras) -> tuple[Tensor, N
     found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions))
     evidence = collect_evidence(found.scores, found.clusters, found.pairwise)
     return found.clusters.drop_singletons().instance_ids(), scene_features(evidence)
-
-
-def fit(outcomes: list[Outcome]) -> NDArray[np.float64]:
-    """(5,) weights of largest likelihood, every region alike."""
-    X = np.concatenate([each.features for each in outcomes if each.features is not None])
-    sign = 2 * np.concatenate([each.is_right for each in outcomes]) - 1.0
-
-    def loss(w: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        margin = sign * (X @ w)
-        return np.logaddexp(0, -margin).mean(), -(sign / (1 + np.exp(margin))) @ X / len(X)
-
-    w: NDArray[np.float64] = minimize(loss, np.zeros(X.shape[1]), jac=True, method="BFGS").x
-    return w
 
 
 def calibration_error(scores: NDArray[np.floating], is_right: NDArray[np.bool_]) -> float:
@@ -201,15 +186,14 @@ def mean(values: Iterable[float]) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_scene_options(parser)
-    parser.add_argument("--most_masks", type=int, default=100, help="scenes of at most this many leaves times views")
-    parser.add_argument("--draws", type=int, default=4, help="faults of the cameras per scene and kind of masks")
     parser.add_argument("--fit", action="store_true", help="print coefficients")
     args = parser.parse_args()
-    work = partial(run_scene, cache=args.cache, num_draws=args.draws, is_fit=args.fit)
-    specs = [spec for spec in chosen_scenes(args) if spec.num_leaves * spec.num_views <= args.most_masks]
+    work = partial(run_scene, cache=args.cache, is_fit=args.fit)
+    specs = [spec for spec in chosen_scenes(args) if spec.num_leaves * spec.num_views <= MOST_MASKS]
     outcomes = [each for of_scene in run_all(work, specs, args.workers) for each in of_scene]
     if args.fit:
-        print("SCENE =", dict(zip(SCENE, fit(outcomes).round(3).tolist(), strict=True)))
+        features = np.concatenate([each.features for each in outcomes if each.features is not None])
+        print("SCENE =", regress(SCENE, features, np.concatenate([each.is_right for each in outcomes])))
         return
     print_scores(outcomes)
     print_groups(outcomes)

@@ -1,4 +1,4 @@
-"""How far answers bring a result: `python benchmarks/corrections.py --cache DIR --scenes BASIL ...`
+"""How far answers bring a result: `python -m benchmarks.corrections --cache DIR --scenes BASIL ...`
 
 A simulated person (`simulated_person.py`) answers the page's questions about what the detector finds in the photos of a
 scene, in rounds, and the stages of `mvseg infer --corrections` run again after each. A question that no answer fits
@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,8 +18,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.choice import true_maps
 from benchmarks.simulated_person import Labels, Look, choose_answers, list_answers

@@ -1,4 +1,4 @@
-"""What does a detector find, and what does the cluster-aware loop add? `python benchmarks/detector.py --scenes DIR ...`
+"""What does a detector find, and what does the cluster-aware loop add? `python -m benchmarks.detector --scenes DIR ...`
 
 Scenes are folders as `mvseg simulate` writes them (photos, true label images, true leaf meshes) or others with the same
 layout; without `truth/leaves` there are no figures for hidden leaves. With `--photos DIR --labels DIR [--every N]` in
@@ -18,7 +18,6 @@ their place, single photos, or every n-th of them, answer the first question. Th
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -31,8 +30,6 @@ import torch
 import trimesh
 from pycocotools import mask as coco_mask
 from tqdm import tqdm
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.choice import true_maps
 from benchmarks.found_leaves import credit_masks, is_found

@@ -8,8 +8,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
-
 Labels = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
@@ -33,13 +31,6 @@ class Faults:
     split: float = 0.05
     blur_px: int = 3
     min_pixels: int = 30
-
-    def __post_init__(self) -> None:
-        for name in ("missed", "merged", "split"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"the share of {name} masks is {getattr(self, name):g}, expected a number in [0, 1]")
-        if self.blur_px < 0 or self.min_pixels < 1:
-            raise InputError(f"blur_px {self.blur_px} and min_pixels {self.min_pixels}, expected >= 0 and >= 1")
 
 
 def degrade_labels(labels: Labels, faults: Faults, *, seed: int) -> Labels:

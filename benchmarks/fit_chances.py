@@ -1,4 +1,4 @@
-"""How often is a pose right, and how often a link? `python benchmarks/fit_chances.py TABLE RESULTS [...]`
+"""How often is a pose right, and how often a link? `python -m benchmarks.fit_chances TABLE RESULTS [...]`
 
 Tables and results of real plants are those of `benchmarks/tracking.py results`; beside them, simulated plants
 of few leaves and of 12 to 30. Of two dates at most three apart, a pose is right where more than half of the leaves that
@@ -13,7 +13,6 @@ it pairs are the same. Prints, each of greatest likelihood,
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -21,8 +20,6 @@ from unittest.mock import patch
 import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit, logit, logsumexp
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.fit_costs import small_specs
 from benchmarks.tracking import read_places, see_series

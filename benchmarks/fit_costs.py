@@ -1,4 +1,4 @@
-"""How much do leaves change between dates? `python benchmarks/fit_costs.py TABLE RESULTS [TABLE RESULTS ...]`
+"""How much do leaves change between dates? `python -m benchmarks.fit_costs TABLE RESULTS [TABLE RESULTS ...]`
 
 Tables and results of real plants are those of `benchmarks/tracking.py results`, that with the most leaves first; beside
 them, simulated plants of 2 to 9 leaves (SMALL) and two of 12 to 30. Dates at most three apart are put into the pose
@@ -14,7 +14,6 @@ that were fitted without it.
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -22,8 +21,6 @@ from unittest.mock import patch
 
 import numpy as np
 from scipy.optimize import minimize
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.simulation.families import FAMILIES

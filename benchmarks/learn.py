@@ -1,31 +1,31 @@
-"""What the views teach: `python benchmarks/learn.py SCENE... [--rounds 3]`
+"""What the views teach: `python -m benchmarks.learn SCENE... [--rounds 3]`
 
 For each scene a table: as it is; after one, two, three rounds (each from the labels of the last, whatever the agreed
 area says); and after one round in which a person has outlined six leaves in two photos each, the largest ones that are
 not right; these outlines do not count in the figures. The agreed area (`rate_pass`, in percent of all pixels) stands
 beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep:
-see `order_ratings`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
-many are stems (`stem_chances`), and E is the expected number of correct masks. Weights and detections are kept in
---cache.
+see `choose_rating`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
+many are stems (`stem_chances`), E is the expected number of correct masks, and the spread of MV-PQ is the standard
+deviation over --worlds, that of the row and turned ones (`spread.py`). Weights and detections are kept in --cache.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.choice import true_maps
 from benchmarks.drawn_leaves import open_views
 from benchmarks.simulated_person import Labels, Look
+from benchmarks.spread import write_turned
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections
 from mvseg.detection.cached_detections import CachedDetections
@@ -42,12 +42,12 @@ from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.traits.filters import SURELY_STEM
-from mvseg.verification.leaf_scores import order_ratings
+from mvseg.verification.leaf_scores import choose_rating
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
 TABLE = (
-    "plant", "seen at", "rounds", "agreement", "agreed area", "E", "MV-PQ", "right", "false (stems)", "recall",
-    "precision", "CPU s",
+    "plant", "seen at", "rounds", "agreement", "agreed area", "E", "MV-PQ", "spread", "right", "false (stems)",
+    "recall", "precision", "CPU s",
 )  # fmt: skip
 HEAD = ("", "agreed area", "stays", "MV-PQ", "right", "false", "recall", "precision", "leaves", "masks", "CPU s")
 
@@ -84,26 +84,35 @@ def show(name: str, plant: Plant, truth: list[Labels] | None, *, stays: str, beg
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
 
 
-def print_as_it_comes(folder: Path, cache: CachedDetections) -> None:
+def print_as_it_comes(folder: Path, cache: CachedDetections, worlds: int) -> None:
     """A row of --table."""
+    row, turned = measure_as_it_comes(folder, cache), list[str]()
+    for seed in range(1, worlds):
+        with TemporaryDirectory() as place:
+            write_turned(folder.resolve(), Path(place) / folder.name, seed)
+            turned.append(measure_as_it_comes(Path(place) / folder.name, cache)["MV-PQ"])
+    spread = np.std([float(each) for each in (row["MV-PQ"], *turned)], ddof=1) if turned else np.nan
+    print("| " + " | ".join((row | {"spread": f"{spread:.3f}"})[name] for name in TABLE) + " |", flush=True)
+
+
+def measure_as_it_comes(folder: Path, cache: CachedDetections) -> dict[str, str]:
+    """The cells of a row of --table, but for the spread."""
     begun = time.process_time()
     opened = open_scene(folder, None, RunConfig(reconstruct=None))
     plant = learn(find_in_photos(opened, cache=cache), cache=cache)
     masks, truth = shape_leaves(plant).masks.to("cpu"), true_maps(folder, opened.scene)
-    figures, area = leaf_metrics(masks.regions, masks.instance_ids, truth), 100 * plant.rating.agreed_area
+    area = 100 * plant.rating.agreed_area / int(opened.scene.cameras.sizes.prod(1).sum())
     chances = torch.tensor([0.0, *(plant.instances.probabilities[n] for n in range(1, masks.num_instances + 1))])
     expected = float((chances[masks.instance_ids.clamp(min=0)] * masks.match_scores).sum())
     of_mask = true_instances(masks.regions, truth, count_background=False)
     stems = [leaf for leaf, chance in stem_chances(plant.instances.starts).items() if chance > SURELY_STEM
              and not bool((of_mask[masks.instance_ids == leaf] > 0).any())]  # fmt: skip
-    area /= int(opened.scene.cameras.sizes.prod(1).sum())
-    cells = (
-        folder.resolve().name, plant.image_size, plant.learned.rounds, f"{plant.agreement:.2f}", f"{area:.2f}",
-        f"{expected:.0f}", f"{figures.mv_pq:.3f}", f"{figures.num_right} of {figures.num_right + figures.num_missed}",
-        f"{figures.num_false} ({len(stems)})", f"{figures.mask_recall:.2f}", f"{figures.mask_precision:.2f}",
-        f"{time.process_time() - begun:.0f}",
-    )  # fmt: skip
-    print("| " + " | ".join(map(str, cells)) + " |", flush=True)
+    row = judge(masks, truth)
+    return row | {
+        "plant": folder.resolve().name, "seen at": f"{plant.image_size} px", "rounds": str(plant.learned.rounds),
+        "agreement": f"{plant.agreement:.2f}", "agreed area": f"{area:.2f}", "E": f"{expected:.0f}",
+        "false (stems)": f"{row['false']} ({len(stems)})", "CPU s": f"{time.process_time() - begun:.0f}",
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -113,6 +122,7 @@ def main() -> None:
     parser.add_argument("--person", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--image_size", type=int, default=None)
     parser.add_argument("--table", action="store_true", help="a row for each scene, as it comes")
+    parser.add_argument("--worlds", type=int, default=1, help="of --table; the spread needs two or more")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -120,7 +130,7 @@ def main() -> None:
     if args.table:
         print("| " + " | ".join(TABLE) + " |\n|" + "---|" * len(TABLE))
         for folder in args.scenes:
-            print_as_it_comes(folder, CachedDetections(args.cache / folder.resolve().name))
+            print_as_it_comes(folder, CachedDetections(args.cache / folder.resolve().name), args.worlds)
         return
     for folder in args.scenes:
         config = RunConfig(reconstruct=None, learn="off", detect=DetectConfig(image_size=args.image_size))
@@ -136,7 +146,7 @@ def main() -> None:
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
             after = replace(plant, colors=before.leaf_colors).rating
-            stays = stays and order_ratings([before.rating, after])[0] == 1
+            stays = stays and choose_rating([before.rating, after]) == 1
             name = f"round {number}, at {plant.image_size} px"
             show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
         if args.person and truth is not None:

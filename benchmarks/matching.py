@@ -1,4 +1,4 @@
-"""How well are regions matched? `python benchmarks/matching.py --cache ~/mvseg-cells [--split dev] [--methods ...]`
+"""How well are regions matched? `python -m benchmarks.matching --cache ~/mvseg-cells [--split dev] [--methods ...]`
 
 The scenes are those of `label_maps`. "true" masks are the visible parts of at least 30 pixels, "degraded" ones have the
 faults of a segmenter. The split "dev" is for choosing parameters; look at "test" once, at the end. `--ablate` removes
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -18,8 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
 from benchmarks.thirds import changed

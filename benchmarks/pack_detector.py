@@ -1,4 +1,4 @@
-"""From a training run to a folder of the zoo: `python benchmarks/pack_detector.py RUN FOLDER [IMAGE_SIZE]`."""
+"""From a training run to a folder of the zoo: `python -m benchmarks.pack_detector RUN FOLDER [IMAGE_SIZE]`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import json
 import shutil
 import sys
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import HASH, WEIGHTS

@@ -1,4 +1,4 @@
-"""How likely do two masks show one leaf? `python benchmarks/pair_odds.py --cache DIR [--leaves ...] [--views ...]`
+"""How likely do two masks show one leaf? `python -m benchmarks.pair_odds --cache DIR [--leaves ...] [--views ...]`
 
 Counts pairs of degraded masks of two views on development plants by their epipolar weight, and prints the log odds that
 both show the same leaf at the weights of `mvseg/matching/nview/cluster_scores.py`, with those that stand there. A pair
@@ -8,13 +8,9 @@ counts for the two nearest of these weights, in proportion; of each, half a pair
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
 import torch
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_maps
 from mvseg.matching.affinity import region_affinity

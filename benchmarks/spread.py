@@ -2,7 +2,7 @@
 
 The same plant in worlds that are turned and moved: what differs is chance, and a gain below twice this spread is none
 (CONTRIBUTING.md). By scene with photos and `truth/`, mean and standard deviation over the worlds: "ids", the ARI of
-given `masks/`; "pixels", MV-PQ of detected leaves, with --learn of those that were found once the detector learned;
+given `masks/`; "pixels", MV-PQ of detected leaves (`learn.py --table --worlds` has it where the detector learns);
 "corrections", MV-PQ after one answer per leaf of a simulated person. With --dates, short- and long-term accuracy of
 tracks, each pot turned at random; TABLE and RESULTS are those of `benchmarks.tracking results`.
 """
@@ -87,12 +87,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="*", help="folders with photos and truth/")
     parser.add_argument("--worlds", type=int, default=3, help="two or more")
-    parser.add_argument("--learn", action="store_true", help="teach the detector, where a run would")
     parser.add_argument("--dates", type=Path, nargs=2, metavar=("TABLE", "RESULTS"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
-    config = RunConfig(learn="auto" if args.learn else "off")
+    config = RunConfig(learn="off")
     print(f"| plant | table | mean of {args.worlds} worlds | spread |\n|---|---|---|---|")
     for folder in args.scenes:
         worlds = []

@@ -1,4 +1,4 @@
-"""How good are nodes? `python benchmarks/stems.py --cache ~/mvseg-cells [--plants 6] [--real FOLDER...]`
+"""How good are nodes? `python -m benchmarks.stems --cache ~/mvseg-cells [--plants 6] [--real FOLDER...]`
 
 Simulated plants of 8 leaves with true ids, 480 x 480, 10 views on a 200 degree arc. Masks are exact, or have the faults
 of a segmenter (`faults.py`); no photos are used. By family and kind of masks: plants whose leaves agree about a stem;
@@ -11,16 +11,15 @@ of the surfaces.
 and root mean square of degrees to the true up, and the share of leans to two sides inside 95 % intervals.
 
 `--real` is for scenes whose label images in `truth/` number the leaves from below: leaves with a node, of all; pairs of
-leaves of one stem in the right order, of all such pairs; source and probability of each stem, its phyllotaxis, and
-where `organs/` exists (1 = stem, 3 = leaf) the share of its axis on stem pixels, of what no leaf hides. Holes of masks
-are closed there: such scenes are rendered from points.
+leaves of one stem in the right order, of all such pairs; quartiles of divergence angles; source and probability of each
+stem, its phyllotaxis, and where `organs/` exists (1 = stem, 3 = leaf) the share of its axis on stem pixels, of what no
+leaf hides. Holes of masks are closed there: such scenes are rendered from points.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ import numpy as np
 import torch
 from scipy import ndimage
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.choice import true_maps
 from benchmarks.label_maps import KINDS, load_maps
@@ -167,6 +164,8 @@ def measure_real(folder: Path) -> str:
     masks = Masks.of(regions, regions.labels)
     stems = find_stems(blades, masks, scene.cameras, frame=frame, photos=Photos(scene))
     pairs = [one.leaf < other.leaf for stem in stems for one, other in itertools.combinations(stem.nodes, 2)]
+    turns = np.array([node.divergence.value for stem in stems for node in stem.nodes])
+    turns = turns[np.isfinite(turns)]
     about = [
         (f"{stem.source}, {stem.probability:.2f}", f"{stem.phyllotaxis.name}, {stem.phyllotaxis.probability:.2f}",
          f"{share_on_stem(stem.axis.points, scene.cameras, organs):.2f}" if organs else "-")
@@ -174,7 +173,8 @@ def measure_real(folder: Path) -> str:
     ]  # fmt: skip
     nodes = f"{sum(len(stem.nodes) for stem in stems)} of {len(regions.labels.unique())}"
     cells = ["; ".join(each) for each in zip(*about, strict=True)] or ["-"] * 3
-    return " | ".join([nodes, f"{np.mean(pairs):.2f} of {len(pairs)}" if pairs else "-", *cells])
+    divergence = " / ".join(f"{each:.0f}" for each in np.quantile(turns, (0.25, 0.5, 0.75))) if len(turns) else "-"
+    return " | ".join([nodes, f"{np.mean(pairs):.2f} of {len(pairs)}" if pairs else "-", divergence, *cells])
 
 
 def close_holes(labels: Ints) -> Ints:
@@ -205,7 +205,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.real:
-        print("| plant | leaves with a node | right order | stem | phyllotaxis | on the stem |")
+        print("| plant | leaves with a node | right order | divergence | stem | phyllotaxis | on the stem |")
         for folder in args.real:
             print(f"| {folder.name} | {measure_real(folder)} |", flush=True)
     elif args.cache is None:

@@ -1,4 +1,4 @@
-"""Matching of long, thin leaves that cross: `python benchmarks/straps.py [--leaves 8 12] [--plants 3]`
+"""Matching of long, thin leaves that cross: `python -m benchmarks.straps [--leaves 8 12] [--plants 3]`
 
 Straps, as maize on a turntable: twelve views around at 10 degrees of elevation and one from the top
 (80 degrees), 480 x 480. "whole" masks are the visible parts of the leaves, "pieces" are their connected parts of 30
@@ -10,14 +10,10 @@ and how many are smaller than 200 pixels.
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
 import numpy as np
 import torch
 from scipy import ndimage
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.confidence import has_right_id
 from benchmarks.faults import Faults, degrade_labels
@@ -25,7 +21,7 @@ from benchmarks.label_maps import MIN_PIXELS, visible_ids
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import true_instances
 from mvseg.matching.match import match_regions
-from mvseg.regions import regions_from_label_maps
+from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import SimulatedPlant, grow_plant
@@ -33,6 +29,7 @@ from mvseg.simulation.growth import SimulatedPlant, grow_plant
 VIEWS, SIDE, TOP = 12, 10.0, 80.0  # views around; degrees of elevation
 SMALL = 200  # pixels
 FIRST_SEED = 7000  # of plants that are in no other set
+KINDS = ("whole", "pieces", "degraded")
 
 
 def strap_cameras(plant: SimulatedPlant) -> Cameras:
@@ -53,6 +50,21 @@ def cut_pieces(labels: np.ndarray) -> np.ndarray:
     return pieces
 
 
+def draw_straps(num_leaves: int, seed: int) -> tuple[list[np.ndarray], Cameras]:
+    """V true label maps of a plant, and its cameras."""
+    plant = grow_plant("strap", num_leaves, seed)
+    cameras = strap_cameras(plant)
+    return list(visible_ids(plant, cameras)), cameras
+
+
+def list_masks(true: list[np.ndarray]) -> dict[str, tuple[Regions, torch.Tensor]]:
+    """Masks and the leaf that each shows: whole, in pieces, and with the faults of a segmenter besides."""
+    pieces = [cut_pieces(labels) for labels in true]
+    faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
+    regions = {name: regions_from_label_maps(maps) for name, maps in zip(KINDS, (true, pieces, faulty), strict=True)}
+    return {name: (each, true_instances(each, true, count_background=False)) for name, each in regions.items()}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--leaves", nargs="+", type=int, default=(8, 12))
@@ -62,14 +74,8 @@ def main() -> None:
     print("".join(f"{name:>11}" for name in header))
     for num_leaves in args.leaves:
         for number in range(args.plants):
-            plant = grow_plant("strap", num_leaves, FIRST_SEED + number)
-            cameras = strap_cameras(plant)
-            true = visible_ids(plant, cameras)
-            pieces = [cut_pieces(labels) for labels in true]
-            faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
-            for kind, maps in (("whole", list(true)), ("pieces", pieces), ("degraded", faulty)):
-                regions = regions_from_label_maps(maps)
-                leaf = true_instances(regions, list(true), count_background=False)
+            true, cameras = draw_straps(num_leaves, FIRST_SEED + number)
+            for kind, (regions, leaf) in list_masks(true).items():
                 ids = match_regions(regions, cameras).instance_ids
                 metrics = matching_metrics(ids, leaf)
                 is_wrong = ~torch.from_numpy(has_right_id(ids.numpy(), leaf.numpy()))

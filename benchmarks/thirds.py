@@ -1,4 +1,4 @@
-"""What does a third more or less of a room's numbers change? `python benchmarks/thirds.py --cache DIR [--room NAME]`
+"""What does a third more or less of a room's numbers change? `python -m benchmarks.thirds --cache DIR [--room NAME]`
 
 Numbers are those of a room's `numbers.py`; one at a time is divided and multiplied by 1.33, whole numbers change by 1
 at least, and of several each by itself. The scenes are development plants.
@@ -33,9 +33,6 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
-
 import mvseg.matching.numbers
 import mvseg.reconstruction.numbers
 import mvseg.tracking.numbers
@@ -44,9 +41,9 @@ from benchmarks.checked_ids import choose_given
 from benchmarks.choice import true_maps
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
-from benchmarks.label_maps import KINDS, LabelledScene, load_maps, plant_index, visible_ids
+from benchmarks.label_maps import KINDS, LabelledScene, load_maps, plant_index
 from benchmarks.simulated_person import Look
-from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
+from benchmarks.straps import FIRST_SEED, draw_straps, list_masks
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
@@ -65,7 +62,6 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions, name_regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_specs
-from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
@@ -217,11 +213,8 @@ def check_simulated(args: argparse.Namespace) -> Iterator[Trial]:
         name, regions = f"{cell[1]} leaves in {cell[0]} views", maps.masks("degraded")[0]
         yield check_trial(name, regions, maps.cameras, maps.true)
     for number in (0, 1):
-        plant = grow_plant("strap", STRAPS, FIRST_SEED + number)
-        cameras = strap_cameras(plant)
-        true = visible_ids(plant, cameras)
-        pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
-        yield check_trial(f"pieces of straps {number}", pieces, cameras, true)
+        true, cameras = draw_straps(STRAPS, FIRST_SEED + number)
+        yield check_trial(f"pieces of straps {number}", list_masks(true)["pieces"][0], cameras, true)
 
 
 def choose_found(args: argparse.Namespace) -> Iterator[Trial]:
@@ -339,7 +332,7 @@ def fit_all(scenes: list[LabelledScene], kind: str) -> np.ndarray:
             graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)
             ids = match_nview(regions, scene.cameras, graph).instance_ids
         for leaf in fit_surfaces(regions, ids, scene.cameras).values():
-            about = leaf.is_credible, len(leaf.quality.reasons), leaf.is_oriented
+            about = leaf.is_credible, len(leaf.reasons), leaf.is_oriented
             rows.append((leaf.area, leaf.deviations[0], *about) if leaf.exists else (np.nan, np.nan, 0, 1, 0))
     return np.array(rows)
 

@@ -22,7 +22,7 @@ import csv
 import itertools
 import json
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -203,9 +203,7 @@ def by_cpd(first: DateLeaves, second: DateLeaves) -> np.ndarray:
     return np.linalg.norm(bent[:, None, :, None] - other[None, :, None], axis=-1).min(3).mean(2)
 
 
-BASELINES: dict[str, Callable[[DateLeaves, DateLeaves], np.ndarray]] = {
-    "nearest base": by_base, "shape": by_shape, "rank": by_rank, "cpd": by_cpd,
-}  # fmt: skip
+BASELINES = {"nearest base": by_base, "shape": by_shape, "rank": by_rank, "cpd": by_cpd}
 
 
 def track_by(name: str, dates: Sequence[PlantOnDate], poses: np.ndarray) -> Labels:
@@ -333,11 +331,11 @@ def turn_date(date: PlantOnDate, degrees: float) -> PlantOnDate:
 # --- tables
 
 
-def compare(series: dict[str, tuple[list[PlantOnDate], Labels]], methods: Sequence[str]) -> None:
+def compare(series: dict[str, tuple[list[PlantOnDate], Labels]]) -> None:
     """Print one row per method, the mean over the plants, and one per plant of ours; then `calibrate`."""
     tracked = {plant: track_leaves(dates) for plant, (dates, _) in series.items()}
     print("| method | short | long | IDF1 | births F1 | deaths F1 |\n|---|---|---|---|---|---|")
-    for method in ("mvseg track", *methods):
+    for method in ("mvseg track", *BASELINES):
         rows = []
         for plant, (dates, truth) in series.items():
             tracks = tracked[plant]
@@ -353,7 +351,7 @@ def compare(series: dict[str, tuple[list[PlantOnDate], Labels]], methods: Sequen
 
 
 def calibrate(series: dict[str, tuple[list[PlantOnDate], Labels]], tracked: dict[str, Tracks]) -> None:
-    """Print how often links of each probability are right, the expected calibration error, and the best stretch."""
+    """Print how often links of each probability are right, and the expected calibration error."""
     chances, rights = [], []
     for plant, (dates, truth) in series.items():
         tracks = tracked[plant]
@@ -377,12 +375,6 @@ def calibrate(series: dict[str, tuple[list[PlantOnDate], Labels]], tracked: dict
             mean, share = chance[inside].mean(), right[inside].mean()
             print(f"| {low:g} to {min(high, 1):g} | {inside.sum()} | {mean:.3f} | {share:.3f} |")
     print(f"expected calibration error {error:.3f} of {len(chance)} links")
-    logit = np.log(np.clip(chance, 1e-6, 1 - 1e-6) / np.clip(1 - chance, 1e-6, 1))
-    best = min(
-        ((a, b) for a in np.linspace(0.2, 2, 37) for b in np.linspace(-3, 3, 61)),
-        key=lambda ab: float(np.mean(np.logaddexp(0, -(2 * right - 1) * (ab[0] * logit + ab[1])))),
-    )
-    print(f"best stretch of these log odds: slope {best[0]:.2f}, offset {best[1]:.2f}")
 
 
 def main() -> None:
@@ -392,17 +384,16 @@ def main() -> None:
     parser.add_argument("--num_plants", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--masks", choices=("true", "degraded"), default="true", help="of prepare")
-    parser.add_argument("--methods", nargs="*", default=["nearest base", "shape", "rank", "cpd"])
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.what == "prepare":
         prepare(*args.places, masks=args.masks)
     elif args.what == "results":
         for series in read_places(args.places).values():
-            compare(series, args.methods)
+            compare(series)
     else:
         specs = draw_specs(args.num_plants, seed=args.seed)
-        compare({spec.name: see_series(spec) for spec in specs}, args.methods)
+        compare({spec.name: see_series(spec) for spec in specs})
 
 
 if __name__ == "__main__":

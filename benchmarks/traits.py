@@ -1,4 +1,4 @@
-"""How good are areas, lengths and widths? `python benchmarks/traits.py --cache ~/mvseg-cells [--views 10] [--plants 6]`
+"""How good are areas, lengths and widths? `python -m benchmarks.traits --cache ~/mvseg-cells [--views 10] [--plants 6]`
 
 Surfaces of simulated leaves against their meshes, by family, number of views and kind of masks ("true": the visible
 parts; "degraded": with the faults of a segmenter; "detected": what the shipped detector finds in the photos; ids are
@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -32,8 +31,6 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 from torch import Tensor
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.choice import true_maps
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, load_photos
@@ -80,7 +77,7 @@ def detect_masks(spec: SceneSpec, scene: LabelledScene, cache: Path) -> tuple[Re
 
 def compare(surface: LeafSurface, leaf: Leaf, teeth: float) -> dict[str, Any]:
     """Signed errors in %, degrees and % of the length; what the surface says of itself."""
-    record: dict[str, Any] = {"exists": surface.exists, "reasons": [*surface.quality.reasons]}
+    record: dict[str, Any] = {"exists": surface.exists, "reasons": [*surface.reasons]}
     if not surface.exists:
         return record
     truth = (leaf.area, leaf.length, leaf.width / (1 + teeth))
@@ -185,7 +182,7 @@ def measure_areas(folder: Path) -> None:
         scene = load_scene(folder / date)
         regions = regions_from_label_maps(true_maps(folder / date, scene))
         for leaf, surface in fit_surfaces(regions, regions.labels, scene.cameras).items():
-            error, reasons = surface.area - true[date, leaf], surface.quality.reasons
+            error, reasons = surface.area - true[date, leaf], surface.reasons
             use = "look" if reasons or not surface.is_credible else "yes"
             form = "occupancy" if surface.occupancy is not None else "whole sheet"
             errors = 100 * abs(error) / true[date, leaf], abs(error) <= 1.96 * surface.deviations[0]

@@ -1,4 +1,4 @@
-"""Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT [SKINS]`.
+"""Simulated plants as unruly as real ones: `python -m benchmarks.unruly_plants OUT [SKINS]`.
 
 Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
 that the scene states are wrong by about 1.5 px. Four plants with truth, to judge on them what is chosen for real
@@ -15,8 +15,6 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-
-sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.camera_faults import rotate_cameras
 from mvseg.formats.label_png import write_label_png
@@ -110,7 +108,7 @@ def write_unruly(
     files = [f"images/{name}.jpg" for name in names]
     views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
     stated = rotate_cameras(cameras, POSE_PX, rng)
-    scene = Scene(name=folder.name, views=views, cameras=stated, unit=plant.unit, up=(0.0, 0.0, 1.0))
+    scene = Scene(name=folder.name, views=views, cameras=stated, unit="mm", up=(0.0, 0.0, 1.0))
     write_rig(folder / "cameras.json", scene, files)
 
 

@@ -150,7 +150,7 @@ class Regions(Table):
         xy = torch.stack((local - down * width + x1, down + y1)).float().add_(0.5).T
         return xy, owner
 
-    def thin(self, most: int) -> tuple[Regions, Tensor, Tensor]:
+    def thin(self, most: float) -> tuple[Regions, Tensor, Tensor]:
         """Thin masks of more than `most` pixels to a square lattice of at most about `most` points; a sliver that
         misses every lattice point keeps all of its pixels.
 

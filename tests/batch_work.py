@@ -66,10 +66,3 @@ def do_as_told(item: str, *_: object) -> tuple[str, int]:
     elif verb == "threads":
         return os.environ["OMP_NUM_THREADS"], os.getpid()
     return verb.upper(), os.getpid()
-
-
-def describe_process() -> tuple[bool, bool]:
-    """Whether pycolmap is loaded, and whether anybody handles SIGTERM, C++ included (Linux only)."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    caught = next(int(line.split()[1], 16) for line in lines if line.startswith("SigCgt:"))
-    return "pycolmap" in sys.modules, bool(caught >> (signal.SIGTERM - 1) & 1)

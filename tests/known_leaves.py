@@ -10,7 +10,7 @@ import torch
 
 from mvseg.arrays import Floats
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, NUM_COEFFICIENTS, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 Sheet = Callable[[Floats, Floats], Floats]  # (along, across) in world units -> (..., 3) points
 
@@ -34,7 +34,7 @@ def make_surface(
         residual_px=torch.full((num_views,), 0.2, dtype=torch.float64),
         iou=torch.full((num_views,), iou, dtype=torch.float64),
         is_oriented=is_oriented,
-        quality=Quality(),
+        reasons={},
     )
 
 

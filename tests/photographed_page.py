@@ -30,19 +30,18 @@ LINEAR = (BLACK + (1 - BLACK) * (np.arange(256) / 255) ** GAMMA).astype(np.float
 
 
 def draw_page(px_per_mm: int) -> np.ndarray:
-    """(H, W, 3) float32 in [0, 1], RGB, linear: the light that the page reflects, the mean over each pixel; modules of
-    tags are whole pixels where `px_per_mm` is a multiple of 4."""
-    fine = 2 * px_per_mm
-    page = np.full((round(HEIGHT * fine), round(WIDTH * fine), 3), 255, np.uint8)
+    """(H, W, 3) float32 in [0, 1], RGB, linear: the light that the page reflects. Modules of tags are whole pixels
+    where `px_per_mm` is a multiple of 4."""
+    page = np.full((round(HEIGHT * px_per_mm), round(WIDTH * px_per_mm), 3), 255, np.uint8)
     for shape in list_shapes():
-        low, high = (np.round(each * fine).astype(int) for each in (shape.cell[0], shape.cell[2]))
-        corners = (shape.outline * fine - low)[:, ::-1] - 0.5  # rows first, from the centre of the first pixel
+        low, high = (np.round(each * px_per_mm).astype(int) for each in (shape.cell[0], shape.cell[2]))
+        corners = (shape.outline * px_per_mm - low)[:, ::-1] - 0.5  # rows first, from the centre of the first pixel
         page[low[1] : high[1], low[0] : high[0]][polygon2mask(tuple((high - low)[::-1]), corners)] = INK
     tags = marker_dictionary(FAMILY)
     for number, corners in tag_corners().items():
-        (x1, y1), (x2, y2) = (np.round(corners[each] * fine).astype(int) for each in (0, 2))
+        (x1, y1), (x2, y2) = (np.round(corners[each] * px_per_mm).astype(int) for each in (0, 2))
         page[y1:y2, x1:x2] = tags.generateImageMarker(number, x2 - x1, borderBits=1)[..., None]
-    return np.asarray(cv2.resize(LINEAR[page], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+    return np.asarray(LINEAR[page])
 
 
 def draw_table(px_per_mm: int, *, seed: int) -> np.ndarray:

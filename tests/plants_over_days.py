@@ -124,7 +124,7 @@ def write_result(
         ))  # fmt: skip
     regions = regions_from_label_maps([labels])
     whole = {"total_leaf_area": Measurement(5000.0, 50.0, "surface")}
-    traits = Traits(plant="p", unit=unit, leaves=tuple(leaves), whole=whole, up=(0.0, 0.0, 1.0))
+    traits = Traits(plant="p", unit=unit, leaves=tuple(leaves), whole=whole, up=(0.0, 0.0, 1.0), up_from="scene")
     height, width = labels.shape
     K = torch.tensor([[[100.0, 0, width / 2], [0, 100, height / 2], [0, 0, 1]]])
     sizes = torch.tensor([[width, height]])

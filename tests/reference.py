@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torchvision.ops import box_iou
 
+from mvseg.matching.links import Links
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -111,35 +112,27 @@ def factorise_reference(W: np.ndarray, H: np.ndarray, num_iterations: int) -> np
     return H
 
 
-def link_average_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.ndarray:
-    """(D,) average linkage that never joins two regions of one view, one join at a time; numbers with gaps."""
-    num = len(W)
-    ids = np.arange(num)
-    if num < 2:
-        return ids
-    total, size = W.copy(), np.ones(num)
-    has_view = np.zeros((num, int(views.max()) + 1), bool)
-    has_view[ids, views] = True
-    mean = np.where(views[:, None] == views, -1.0, W)
-    best = mean.max(1)
+def link_average_reference(W: np.ndarray, views: np.ndarray, stop: float, links: Links | None = None) -> np.ndarray:
+    """(D,) average linkage that never joins two regions of one view, nor what links keep apart: nodes of a few regions,
+    and the mean weights between them, computed afresh at each step."""
+    node = (links or Links.of()).components(len(W))
+    clusters = [np.flatnonzero(node == n).tolist() for n in range(node.max() + 1)]
+    apart = set() if links is None else {frozenset((int(node[a]), int(node[b]))) for a, b in links.cannot.tolist()}
     while True:
-        a = int(best.argmax())
-        if best[a] < stop or best[a] <= 0:
-            return ids
-        b = int(mean[a].argmax())
-        ids[ids == b] = a
-        has_view[a] |= has_view[b]
-        total[a] += total[b]
-        total[:, a] = total[a]
-        size[a] += size[b]
-        size[b] = 0
-        may_join = (size > 0) & ~(has_view & has_view[a]).any(1)
-        row = np.where(may_join, total[a] / np.maximum(size[a] * size, 1), -1.0)
-        stale = (mean[:, a] >= best) | (mean[:, b] >= best)
-        mean[a], mean[:, a], mean[b], mean[:, b] = row, row, -1.0, -1.0
-        best = np.maximum(best, row)
-        stale[[a, b]] = True
-        best[stale] = mean[stale].max(1)
+        options = [
+            (float(W[np.ix_(a, b)].mean()), a, b)
+            for a, b in combinations(clusters, 2)
+            if not set(views[a]) & set(views[b])
+            and not any(frozenset((int(node[n]), int(node[m]))) in apart for n in a for m in b)
+        ]
+        best = max(options, key=lambda option: option[0], default=(0.0, [], []))
+        if best[0] < stop or best[0] <= 0:
+            break
+        clusters = [c for c in clusters if c is not best[1] and c is not best[2]] + [best[1] + best[2]]
+    ids = np.empty(len(W), np.int64)
+    for index, cluster in enumerate(clusters):
+        ids[cluster] = index
+    return ids
 
 
 def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float) -> list[int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,19 @@ OPTIONS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftsh
 NO_WEBGL = ["--disable-gpu", "--disable-3d-apis", "--no-sandbox"]
 BLANK = "about:blank"
 WAIT_MS = 60_000  # WebGL without a GPU, on a busy machine
+
+
+def browser_with(*options: str) -> Callable[..., Any]:
+    """The fixture `browser` of a module."""
+
+    @pytest.fixture(scope="module")
+    def browser() -> Iterator[sync_api.Browser]:
+        with sync_api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=options, timeout=WAIT_MS)
+            yield browser
+            browser.close()
+
+    return browser
 
 
 class Opened:

@@ -30,7 +30,7 @@ def describe(result: Result) -> dict[str, Any]:
     """{name: what is compared}, as values, tensors, and mappings and lists of these."""
     scene, masks, instances, report = result.scene, result.masks.to("cpu"), result.instances, result.matching.report
     sizes = masks.regions.boxes[:, 2:].tolist()
-    surfaces = ("quality", "is_oriented", "coefficients", "covariance", "views", "residual_px", "iou")
+    surfaces = ("reasons", "is_oriented", "coefficients", "covariance", "views", "residual_px", "iou")
     return {
         "scene": [scene.name, scene.unit, scene.up, [view.name for view in scene.views], result.mask_kind],
         "cameras": {name: getattr(scene.cameras, name) for name in ("K", "R", "t", "sizes")},

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -43,7 +44,8 @@ def serve(what: Path | OpenTracks) -> Iterator[CorrectionServer]:
     """The server of a result folder, or of tracks, which computes, too."""
     corrector = Corrector(OpenResult(what) if isinstance(what, Path) else what)
     with CorrectionServer(corrector) as server:
-        threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
+        works = partial(server.serve_forever, poll_interval=0.02), corrector.compute
+        threads = [threading.Thread(target=work) for work in works]
         for thread in threads:
             thread.start()
         yield server

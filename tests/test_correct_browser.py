@@ -13,19 +13,14 @@ from mvseg.config import RunConfig
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.runs.request import RunRequest
 from mvseg.server.local_server import CorrectionServer
-from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
+from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, browser_with, sync_api
 from scene_folders import write_scene
 from served_result import Lesson, SlowLook, serve, text_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[sync_api.Browser]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
-        yield browser
-        browser.close()
+browser = browser_with(*NO_WEBGL)
 
 
 @pytest.fixture

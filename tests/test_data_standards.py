@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from csv_rows import read_rows
 from mvseg.traits.ontology import DEFINITIONS
 
 RECIPE = Path(__file__).parent.parent / "docs" / "recipes" / "miappe_brapi.py"
@@ -69,11 +70,6 @@ def plants(**changes: str) -> list[dict[str, str]]:
     return [*rows[:2], rows[2] | changes]
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture
 def traits(tmp_path: Path) -> Path:
     return write_traits(tmp_path / "traits.csv", plants())
@@ -87,29 +83,29 @@ def test_the_tables_are_what_the_checklist_asks_for(traits: Path) -> None:
     sections = {section for section, *_ in CHECKLIST}
     assert {path.stem for path in out.iterdir()} == {*sections, "observations"}
     for section in sections:
-        rows = read_table(out / f"{section}.csv")
+        rows = read_rows(out / f"{section}.csv")
         known = {field: cardinality for name, field, cardinality in CHECKLIST if name == section}
         assert set(rows[0]) <= {*known, *LINKS}
         for field, cardinality in known.items():
             if cardinality[0] in "12":
                 assert all(row[field] for row in rows), field
-    assert [row["Observation unit ID"] for row in read_table(out / "observation_unit.csv")] == ["p1", "p2"]
-    (factor,) = read_table(out / "experimental_factor.csv")
+    assert [row["Observation unit ID"] for row in read_rows(out / "observation_unit.csv")] == ["p1", "p2"]
+    (factor,) = read_rows(out / "experimental_factor.csv")
     assert factor["Experimental Factor values"] == "dry; wet"
-    assert [row["Observation Unit factor value"] for row in read_table(out / "observation_unit.csv")] == [
+    assert [row["Observation Unit factor value"] for row in read_rows(out / "observation_unit.csv")] == [
         "treatment:dry", "treatment:wet",
     ]  # fmt: skip
-    assert len(read_table(out / "biological_material.csv")) == 1
+    assert len(read_rows(out / "biological_material.csv")) == 1
 
 
 def test_every_number_has_its_unit_and_variable(traits: Path) -> None:
     out = traits.with_name("out")
     convert(["miappe", str(traits), str(out)])
-    numbers = read_table(out / "observations.csv")
+    numbers = read_rows(out / "observations.csv")
     assert len(numbers) == 9  # the missing one is left out
-    units = {row["Observation unit ID"] for row in read_table(out / "observation_unit.csv")}
-    variables = {row["Variable ID"]: row for row in read_table(out / "observed_variable.csv")}
-    assert len(variables) == len(read_table(out / "observed_variable.csv")) == 3
+    units = {row["Observation unit ID"] for row in read_rows(out / "observation_unit.csv")}
+    variables = {row["Variable ID"]: row for row in read_rows(out / "observed_variable.csv")}
+    assert len(variables) == len(read_rows(out / "observed_variable.csv")) == 3
     assert {row["Observation unit ID"] for row in numbers} == units
     assert {row["Variable ID"] for row in numbers} == variables.keys()
     assert variables["leaf_area_mvseg_mm2"]["Trait accession number"] == "TO:0000540"

@@ -98,7 +98,7 @@ def test_double_detectors_answer_in_single(model: MaskRCNN, photos: list[Tensor]
 
 
 def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor]) -> None:
-    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=5)
     with other_device() as device:
         moved, images = there(wrapped, device), [photo.to(device) for photo in photos]
         expected = wrapped(photos, cameras=CAMERAS)  # by the same operations: ids in noise turn on the last bit
@@ -111,7 +111,7 @@ def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor
 
 
 def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor]) -> None:
-    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=5)
     with other_device() as device:
         images = (photo.to(device) for photo in photos)
         found = there(wrapped, device).find_regions(images, CAMERAS.to(device)).masks
@@ -125,7 +125,7 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor]) -> 
 
 def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
     """And their answer is where the images are."""
-    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=5, verify=True)
 
     def choose(proposals: Masks, matched: dict[str, Masks], judges: Judges, **_: object) -> Leaves:
         tables = [proposals, *matched.values()]
@@ -133,7 +133,7 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
         return Leaves(proposals, surfaces={}, probabilities={}, rejected=(), keys={})
 
     monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
-    monkeypatch.setattr("mvseg.pipeline.find_in_photos.choose_size", lambda _, first: [first])
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.choose_size", lambda _, first: first)
     results = wrapped(photos, cameras=CAMERAS)
     with other_device() as device:
         answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
@@ -144,7 +144,7 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
 def test_autocast_there_reaches_the_backbone_and_no_boxes(model: MaskRCNN, photos: list[Tensor]) -> None:
     """The cameras may have stayed on the CPU."""
     with other_device() as device:
-        wrapped, seen = there(MultiViewMaskRCNN(model, proposals_per_view=8), device), []
+        wrapped, seen = there(MultiViewMaskRCNN(model, proposals_per_view=5), device), []
         wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
         wrapped.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
         with torch.autocast(device.type, torch.bfloat16):

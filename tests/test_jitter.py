@@ -47,4 +47,4 @@ def test_areas_stay(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.
         for leaf, surface in given.items():
             assert jittered[leaf].area == pytest.approx(surface.area, rel=MOST_AREA)
             assert jittered[leaf].is_oriented == surface.is_oriented
-            assert jittered[leaf].quality == surface.quality
+            assert jittered[leaf].reasons == surface.reasons

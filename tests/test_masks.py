@@ -66,12 +66,9 @@ def test_the_columns_of_all_tables_move_together(rows: Table) -> None:
         assert same(joined.select(torch.arange(5, 10)), rows.select(order).to("cpu"))
 
 
-def test_concatenated_tables_share_no_instance() -> None:
+def test_concatenated_tables_share_no_instance_and_their_reports_are_joined() -> None:
     joined = Masks.concatenate([table(), table()])
     assert joined.instance_ids.tolist() == [2, 1, 2, -1, 3, 5, 4, 5, -1, 6]
-
-
-def test_reports_are_joined() -> None:
     plain = MatchReport("symnmf")
     full = MatchReport("nview", True, residual_px=1, explained=0.8, view_explained=torch.tensor([0.7, float("nan")]))
     other = replace(full, residual_px=2, explained=0.4, view_explained=torch.tensor([0.5, 0.6]))
@@ -98,8 +95,5 @@ def test_new_pixels_keep_all_else() -> None:
     assert cut.regions.areas.tolist() == [1] * 5
     assert torch.equal(cut.instance_ids, masks.instance_ids)
     assert torch.equal(cut.view_index, masks.view_index)
-
-
-def test_columns_have_a_row_for_every_region() -> None:
     with pytest.raises(InputError, match=r"5 regions with columns of \[4, 5, 5, 5, 5, 5, 5\] rows"):
         replace(table(), instance_ids=torch.ones(4, dtype=torch.int64))

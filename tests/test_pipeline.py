@@ -39,7 +39,7 @@ from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import read_masks
 from mvseg.pipeline.finish import _find_doubtful, shape_leaves
 from mvseg.pipeline.plant import Plant
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.result import Result
 from mvseg.runs.one_scene import describe_run
@@ -80,9 +80,6 @@ def test_ids_are_those_of_the_balls(plant: Path) -> None:
     pairs = set(zip(ball.tolist(), result.matching.instance_ids.tolist(), strict=True))
     assert len(pairs) == 3
     assert result.matching.num_instances == 3
-
-
-def test_ids_only(plant: Path) -> None:
     result = run_scene(plant, plant / "masks", IDS_ONLY)
     assert (result.surfaces, result.voxels, result.traits) == (None, None, None)
     assert [*result.seconds] == ["load", "match", "choose", "check"]
@@ -130,12 +127,9 @@ def test_the_users_word_on_the_world(plant: Path) -> None:
         assert other.numbers["x_min"].value == pytest.approx(leaf.numbers["x_min"].value / 10, abs=1e-9)
 
 
-def test_another_unit_without_a_scale_is_warned_of(plant: Path) -> None:
+def test_units_scales_and_ups_that_the_cameras_contradict(plant: Path, tmp_path: Path) -> None:
     with warns_of("unit_only_renamed"):
         assert run_scene(plant, plant / "masks", replace(IDS_ONLY, unit="cm")).scene.unit == "cm"
-
-
-def test_a_scale_without_a_unit_is_refused_where_the_cameras_say_theirs(plant: Path, tmp_path: Path) -> None:
     scaled = replace(IDS_ONLY, scale=0.001)
     with pytest.raises(InputError, match=r"scale is 0\.001 without a unit, but the cameras are in mm: expected"):
         run_scene(plant, plant / "masks", scaled)
@@ -146,9 +140,6 @@ def test_a_scale_without_a_unit_is_refused_where_the_cameras_say_theirs(plant: P
     del rig["unit"]
     (unknown / "cameras.json").write_text(json.dumps(rig))
     assert run_scene(unknown, unknown / "masks", scaled).scene.unit == ""
-
-
-def test_an_up_that_the_cameras_contradict_is_warned_of(plant: Path) -> None:
     run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, -1.0, 0.0)))  # +y is down there
     with warns_of("upside_down"):
         run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, 1.0, 0.0)))
@@ -292,9 +283,7 @@ def test_warnings_before_an_error_are_given(plant: Path, monkeypatch: pytest.Mon
 
 def test_shapes_with_a_reason_are_doubtful() -> None:
     codes = ([], [], ["two_views"], ["poor_fit"])
-    surfaces = {
-        leaf: replace(bent_blade(), quality=Quality(dict.fromkeys(each, "why"))) for leaf, each in enumerate(codes, 1)
-    }
+    surfaces = {leaf: replace(bent_blade(), reasons=dict.fromkeys(each, "why")) for leaf, each in enumerate(codes, 1)}
     finding = _find_doubtful(surfaces, [])
     assert finding.values == {"count": 2, "total": 4, "leaves": ("3", "4")}
     finding = _find_doubtful(surfaces, [4])

@@ -133,7 +133,7 @@ def test_places_that_are_not_ours(
     plant = tmp_path / "plant"
     shutil.copytree(photos, plant / "images")
     assert main(["pose", str(plant / "images"), "--out", str(plant)]) == 2
-    assert "holds files that are not a scene of mvseg pose" in capsys.readouterr().err
+    assert "the photos lie in it, expected a folder of its own" in capsys.readouterr().err
     (tmp_path / "empty").mkdir()
     assert main(["pose", str(tmp_path / "empty"), "--out", str(tmp_path / "out")]) == 2
     assert "found 0 photos" in capsys.readouterr().err

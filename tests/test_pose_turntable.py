@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -51,15 +50,13 @@ def test_a_table_is_calibrated_once_and_serves_other_photos(tmp_path: Path, caps
     assert len(points) == 12
     np.testing.assert_allclose(torch.pdist(torch.tensor(found)), torch.pdist(torch.tensor(printed)), atol=0.3)  # mm
 
-    shutil.rmtree(photos)
-    write_photos(photos, [draw_board(angle) for angle in ANGLES])
+    (photos / f"{len(ANGLES)}.png").unlink()
     plant = tmp_path / "plant"
     again = ["pose", str(photos), "--out", str(plant), "--turntable", str(table / "turntable.json")]
     assert main([*again, "--quiet"]) == 0
     same = load_scene(plant)
     torch.testing.assert_close(same.cameras.t, scene.cameras.t)
     assert (same.unit, len(same.views)) == ("mm", len(ANGLES))
-    assert main([*again, "--quiet"]) == 0
     assert capsys.readouterr().err == ""
     assert json.loads((table / "pose.json").read_text())["registered"] == [f"{view}.png" for view in range(len(ANGLES))]
 

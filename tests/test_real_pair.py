@@ -17,16 +17,7 @@ import torch
 from skimage.data import stereo_motorcycle
 from torch import Tensor
 
-from mvseg import (
-    MatchConfig,
-    Regions,
-    Scene,
-    load_masks,
-    load_photos,
-    load_scene,
-    match_regions,
-    matching_metrics,
-)
+from mvseg import MatchConfig, Regions, Scene, load_masks, load_photos, load_scene, match_regions, matching_metrics
 from scene_folders import write_image
 from warned import warns_of
 

@@ -110,16 +110,13 @@ def test_wrong_shape_is_named() -> None:
         Cameras(cameras.K, cameras.R, cameras.t[:3], cameras.sizes)
 
 
-def test_views_are_selected_with_their_cameras() -> None:
+def test_views_are_selected_with_their_cameras_and_have_names_of_their_own() -> None:
     views = tuple(View(name, Path(f"{name}.jpg")) for name in "abc")
     scene = Scene("plant", views, ring_cameras(3), unit="mm", up=(0.0, 0.0, 1.0))
     some = scene.select(torch.tensor([2, 0]))
     assert [view.name for view in some.views] == ["c", "a"]
     assert torch.equal(some.cameras.t, scene.cameras.t[[2, 0]])
     assert (some.name, some.unit, some.up) == ("plant", "mm", (0, 0, 1))
-
-
-def test_two_views_of_one_name_are_an_error() -> None:
     views = tuple(View(name, Path(name)) for name in ("a", "b", "a", "c"))
     with pytest.raises(InputError, match="views 0 and 2 have the same name 'a'"):
         Scene("plant", views, some_cameras())

@@ -42,7 +42,7 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
     return line.removeprefix("mvseg: error: ")
 
 
-def test_areas_are_those_of_the_formulas() -> None:
+def test_shapes_have_the_areas_of_the_formulas_and_touch_nothing_else() -> None:
     """A bent leaf has that of a straight one: what a half gains outside of the arc, the other loses inside (Pappus)."""
     disc, *leaves = list_shapes()
     assert disc.area == pytest.approx(np.pi * 35**2, rel=2e-5)
@@ -51,9 +51,6 @@ def test_areas_are_those_of_the_formulas() -> None:
     for leaf, (length, width, base, tip) in zip(leaves, formulas, strict=True):
         half = u**base * (1 - u) ** tip
         assert leaf.area == pytest.approx(length * width * (half / half.max()).mean(), rel=1e-4)
-
-
-def test_nothing_on_the_page_touches_anything_else() -> None:
     boxes = [(shape.cell[0], shape.cell[2]) for shape in list_shapes()]
     boxes += [(corners[0] - TAG / 8, corners[2] + TAG / 8) for corners in tag_corners().values()]  # with a white module
     for index, (low, high) in enumerate(boxes):
@@ -156,13 +153,12 @@ def test_a_photo_without_shapes_is_named(two_photos: Path, tmp_path: Path, capsy
     assert complaint(capsys) == f"{path}: view 1: {expected}"
 
 
-def test_photos_of_something_else(capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos_of_something_else_and_cameras_without_a_unit(
+    capsys: pytest.CaptureFixture[str], two_photos: Path, tmp_path: Path
+) -> None:
     assert main(["check", str(demo_scene()), "--target", "--quiet"]) == 2
     said = "no tag of the page is found in the photos, expected photos of the page that mvseg target writes"
     assert complaint(capsys) == f"{demo_scene() / 'cameras.json'}: {said}"
-
-
-def test_cameras_without_a_unit(two_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = json.loads((two_photos / "cameras.json").read_text())
     (tmp_path / "cameras.json").write_text(json.dumps(rig | {"unit": ""}))
     (tmp_path / "images").symlink_to(two_photos / "images")

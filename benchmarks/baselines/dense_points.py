@@ -38,11 +38,6 @@ class DensePoints:
     positions: Tensor
     backend: str
 
-    def __post_init__(self) -> None:
-        if self.positions.ndim != 2 or self.positions.shape[1] != 3 or not torch.isfinite(self.positions).all():
-            raise InputError(f"points have shape {tuple(self.positions.shape)}, expected finite numbers, (P, 3)")
-        object.__setattr__(self, "positions", self.positions.double())
-
 
 def sgbm_points(scene: Scene) -> DensePoints:
     """Points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; backend "sgbm".

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from mvseg.errors import InputError
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import VoxelGrid, back_project
 from mvseg.regions import Regions
@@ -16,10 +15,6 @@ def reconstruct_semantic(
 
     A voxel is occupied when, of the views that show any leaf, more than a share of `config.threshold` have a mask
     there. Give a voxel size to compare with instances: the voxel budget is for the whole plant here. None when fewer
-    than two views show anything, or no point has enough votes. Raises InputError: regions and cameras of different
-    numbers of views; see also `back_project`.
+    than two views show anything, or no point has enough votes. Raises InputError: see `back_project`.
     """
-    if len(scene.cameras) != regions.num_views:
-        message = f"regions of {regions.num_views} views with {len(scene.cameras)} cameras"
-        raise InputError(f"{message}, expected as many of each")
     return back_project(regions, scene.cameras, config=config)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, nearest_point
 
 MAX_ANGLE_DEG = 25.0  # between the directions to two cameras; beyond it semi-global matching finds next to nothing
 NUM_NEIGHBOURS = 2  # nearest views that every view is paired with
@@ -59,9 +59,8 @@ def seen_ball(cameras: Cameras) -> Ball:
 
     Assumes that the cameras stand around one object, as in the paper; nothing else bounds the depths.
     """
-    centers, axes = cameras.centers, cameras.R[:, 2]
-    across = torch.eye(3).to(axes) - axes[:, :, None] * axes[:, None]
-    center = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    centers = cameras.centers
+    center = nearest_point(centers, cameras.R[:, 2])
     slope = (cameras.sizes / 2 / cameras.K.diagonal(dim1=1, dim2=2)[:, :2]).amin(1)
     radius = (torch.linalg.vector_norm(centers - center, dim=1) * slope.atan().sin()).median()
     return Ball(center, BALL_MARGIN * float(radius))

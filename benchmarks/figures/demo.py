@@ -1,8 +1,7 @@
-"""Draws docs/demo.jpg from the result of the shipped scene: `python infer.py && python benchmarks/figures/demo.py`"""
+"""Draws docs/demo.jpg from the result of the shipped scene: `python infer.py && python -m benchmarks.figures.demo`"""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +9,6 @@ import cv2
 import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
-
-sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from mvseg.formats.image_file import read_rgb
 from mvseg.formats.label_png import read_labels

@@ -1,4 +1,4 @@
-"""Draws docs/walks.svg, how two sets of cameras stand round their plants: `python benchmarks/figures/walks.py GOOD BAD`
+"""Draws docs/walks.svg, how two sets of cameras stand round their plants: `python -m benchmarks.figures.walks GOOD BAD`
 
 Each dot is a camera as the plant sees it: all round the circle by its azimuth, and the nearer to the middle the higher
 it stands. GOOD and BAD are scene folders.
@@ -11,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).parents[2]))
-
 from mvseg.formats.scene_folder import load_scene
+from mvseg.scene import nearest_point
 
 OUT = Path(__file__).parents[2] / "docs" / "walks.svg"
 RADIUS, STEP = 110, 290
@@ -23,14 +22,12 @@ SAID = ("good: round the plant, at two heights", "bad: from one side only")
 def find_directions(folder: Path) -> np.ndarray:
     """(V, 3) unit vectors from the point that all cameras look at to these, in axes whose third one is up."""
     cameras = load_scene(folder).cameras
-    centers, axes = cameras.centers.double().numpy(), cameras.R[:, 2].double().numpy()
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    middle = np.linalg.solve(across.sum(0), (across @ centers[:, :, None]).sum(0)[:, 0])
+    axes = cameras.R[:, 2].double().numpy()
     up = -cameras.R[:, 1].double().numpy().mean(0)  # where photos are upright
     up /= np.linalg.norm(up)
     east = np.cross(up, axes.mean(0) if abs(up @ axes.mean(0)) < 0.9 else axes[0])
     east /= np.linalg.norm(east)
-    sights = centers - middle
+    sights = (cameras.centers - nearest_point(cameras.centers, cameras.R[:, 2])).double().numpy()
     return (sights / np.linalg.norm(sights, axis=1, keepdims=True)) @ np.stack([east, np.cross(up, east), up], 1)
 
 

@@ -1,8 +1,7 @@
 """`python -m benchmarks.paper_tables [--preset small|paper] [--cache DIR] ...`: run what is missing, print the tables.
 
 The paper's tables 1 to 3 and the question of |k|, on simulated test plants and real scenes. The scenes, and one record
-per scene and method, are kept in the cache folder. After an interruption the same command goes on; with --print_only it
-prints the records so far.
+per scene and method, are kept in the cache folder. After an interruption the same command goes on.
 """
 
 from __future__ import annotations
@@ -18,8 +17,6 @@ from tqdm import tqdm
 
 from benchmarks.paper_tables.cells import PRESETS, list_cells
 from benchmarks.paper_tables.experiments import TABLES, Plan, run_real, run_simulated
-from benchmarks.paper_tables.methods import METHODS
-from benchmarks.paper_tables.shapes import SHAPES
 from benchmarks.paper_tables.tables import print_tables
 from mvseg.system.worker_pool import run_all
 
@@ -34,17 +31,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         preset=args.preset,
         cache=args.cache,
         tables=tuple(name for name in TABLES if name in args.tables),
-        methods=tuple(name for name in METHODS if name in args.methods),
-        shapes=tuple(name for name in SHAPES if name in args.shapes),
-        shape_plants=args.shape_plants,
         detector=args.detector,
         real=tuple(args.real),
     )
-    if not args.print_only:
-        torch.set_num_threads(1)
-        run_scenes(partial(run_simulated, plan=plan), list_cells(PRESETS[plan.preset]), args.num_workers)
-        if "2" in plan.tables:
-            run_scenes(partial(run_real, plan=plan), plan.real, args.num_workers)
+    torch.set_num_threads(1)
+    run_scenes(partial(run_simulated, plan=plan), list_cells(PRESETS[plan.preset]), args.num_workers)
+    if "2" in plan.tables:
+        run_scenes(partial(run_real, plan=plan), plan.real, args.num_workers)
     print_tables(plan)
 
 
@@ -64,13 +57,9 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--preset", choices=list(PRESETS), default="small", help="small: 4 scenes, minutes; paper: 48")
     parser.add_argument("--cache", type=Path, default=Path("results/paper_tables"), help="for scenes and records")
     parser.add_argument("--tables", nargs="+", choices=TABLES, default=TABLES)
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS), metavar="METHOD")
-    parser.add_argument("--shapes", nargs="+", choices=list(SHAPES), default=list(SHAPES), metavar="SHAPE")
-    parser.add_argument("--shape_plants", type=int, default=1, help="plants per number of leaves in table 3")
     parser.add_argument("--num_workers", type=int, default=1, help="scenes at once")
     parser.add_argument("--detector", help="also match the masks of this detector: a shipped one's name, or a file")
-    parser.add_argument("--real", "--basil", nargs="+", type=Path, default=[], help="real scene folders for table 2")
-    parser.add_argument("--print_only", action="store_true", help="run nothing, print the records so far")
+    parser.add_argument("--real", nargs="+", type=Path, default=[], help="real scene folders for table 2")
     return parser
 
 

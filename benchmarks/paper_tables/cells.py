@@ -27,7 +27,6 @@ PAPER = replace(dataset.PRESETS["paper-eval"], plants=(("test", 3),))
 PRESETS = {
     "paper": PAPER,
     "small": replace(PAPER, plants=(("test", 1),), leaves=(4, 8), views=(3, 5), size=(240, 240)),
-    "tiny": replace(PAPER, plants=(("test", 1),), leaves=(4,), views=(3,), size=(120, 120)),
 }
 
 

@@ -30,9 +30,6 @@ class Plan:
         preset: a key of `PRESETS`.
         cache: folder for scenes and records.
         tables: of `TABLES`.
-        methods: keys of `METHODS`.
-        shapes: keys of `SHAPES`.
-        shape_plants: plants per number of leaves in table 3.
         detector: a detector whose masks are matched, too; None for none.
         real: folders of real scenes.
     """
@@ -40,9 +37,6 @@ class Plan:
     preset: str
     cache: Path
     tables: tuple[str, ...] = TABLES
-    methods: tuple[str, ...] = tuple(METHODS)
-    shapes: tuple[str, ...] = tuple(SHAPES)
-    shape_plants: int = 1
     detector: str | None = None
     real: tuple[Path, ...] = ()
 
@@ -77,7 +71,7 @@ def run_real(folder: Path, plan: Plan) -> None:
     """Make the missing records of one real scene, matched with its true masks."""
     cell = read_cell(folder, folder.resolve().name, {})
     masks = functools.cache(partial(make_masks, cell, plan))  # each kind is made once
-    for method in plan.methods:
+    for method in METHODS:
         path = real_record(plan, folder, method)
         keep_record(path, partial(score_kind, cell, masks, kind="true", method=method, cache=plan.cache))
 
@@ -92,15 +86,15 @@ def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
     file = spec.folder.replace("/", "_") + ".json"
     if "1" in plan.tables:
         for kind in plan.kinds:
-            for method in plan.methods:
+            for method in METHODS:
                 path = plan.match_records(kind) / slug(method) / file
                 yield path, partial(score_kind, kind=kind, method=method, cache=plan.cache)
     if "k" in plan.tables:
         for kind in ("true", "degraded"):
             path = plan.records / "numbers" / slug(kind) / file
             yield path, partial(score_numbers_of, kind=kind)
-    if "3" in plan.tables and plant_index(spec) < plan.shape_plants:
-        for name in plan.shapes:
+    if "3" in plan.tables and plant_index(spec) == 0:
+        for name in SHAPES:
             path = plan.records / "shapes" / slug(name) / file
             yield path, partial(measure_shape, name=name, cache=plan.cache)
 

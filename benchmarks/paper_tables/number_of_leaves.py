@@ -47,8 +47,7 @@ def score_numbers(cell: Cell, masks: Masks) -> Record:
     record: Record = {}
     for name, k in chosen.items():
         metrics = matching_metrics(partitions[k][judged], masks.true_ids[judged])
-        measures = {"s_match": metrics.s_match, "e_k": metrics.e_k, "ari": metrics.ari, "f1": metrics.pair_f1}
-        record[name] = {**measures, "k": k}
+        record[name] = {"s_match": metrics.s_match, "e_k": metrics.e_k, "ari": metrics.ari}
     return record
 
 

@@ -16,12 +16,7 @@ from benchmarks.baselines.semantic import reconstruct_semantic
 from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.masks import Masks
 from benchmarks.paper_tables.methods import dense_points
-from benchmarks.paper_tables.shape_error import (
-    measure_points,
-    measure_shares,
-    true_leaves,
-    unite,
-)
+from benchmarks.paper_tables.shape_error import measure_points, measure_shares, true_leaves, unite
 from mvseg.errors import InputError, InputWarning
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
@@ -35,6 +30,7 @@ DEFAULT_SHARE = f"{ReconstructConfig.seen_share:g}"  # one of these
 
 Masked = Callable[[str], Masks]  # the masks of a cell by kind
 Shape = Callable[[Cell, Masked, Path], Record]
+Rule = Callable[[Cell, Masks, Tensor], Record]
 
 
 @lru_cache(maxsize=100)
@@ -128,22 +124,12 @@ def semantic(kind: str) -> Shape:
     return measure
 
 
-def matched(kind: str, method: Literal["symnmf", "nview"]) -> Shape:
-    """Estimated ids and the paper's rule."""
+def matched(kind: str, method: Literal["symnmf", "nview"], rule: Rule = measure_thresholds) -> Shape:
+    """Estimated ids, and the paper's rule or that for hidden parts."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
         of_kind = masks(kind)
-        return measure_thresholds(cell, of_kind, estimate(cell, of_kind, method))
-
-    return measure
-
-
-def matched_hidden(kind: str) -> Shape:
-    """Estimated ids and the rule for hidden parts."""
-
-    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
-        of_kind = masks(kind)
-        return measure_hidden(cell, of_kind, estimate(cell, of_kind, "nview"))
+        return rule(cell, of_kind, estimate(cell, of_kind, method))
 
     return measure
 
@@ -161,8 +147,8 @@ SHAPES: dict[str, Shape] = {
     "semantic segmentation, degraded masks": semantic("degraded"),
     "MVIS (paper), true masks": matched("true", "symnmf"),
     "MVIS (nview), true masks": matched("true", "nview"),
-    "MVIS (nview), true masks, hidden parts": matched_hidden("true"),
+    "MVIS (nview), true masks, hidden parts": matched("true", "nview", measure_hidden),
     "MVIS (paper), degraded masks": matched("degraded", "symnmf"),
     "MVIS (nview), degraded masks": matched("degraded", "nview"),
-    "MVIS (nview), degraded masks, hidden parts": matched_hidden("degraded"),
+    "MVIS (nview), degraded masks, hidden parts": matched("degraded", "nview", measure_hidden),
 }

@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.label_maps import plant_index
 from benchmarks.paper_tables import printed
 from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_record
 from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
-from benchmarks.paper_tables.methods import PRINTED
+from benchmarks.paper_tables.methods import METHODS
 from benchmarks.paper_tables.number_of_leaves import RULES
 from benchmarks.paper_tables.shapes import DEFAULT_SHARE, SHAPES, THRESHOLDS
 
@@ -26,7 +25,7 @@ def print_tables(plan: Plan) -> None:
     for kind in plan.kinds:
         if read_matches(plan, kind):
             print(f"Table 1, {kind} masks: {count_masks(plan, kind)}\n\n{table_1(plan, kind)}\n")
-    if any(real_record(plan, folder, method).is_file() for folder in plan.real for method in plan.methods):
+    if any(real_record(plan, folder, method).is_file() for folder in plan.real for method in METHODS):
         print(f"Table 2, real scenes\n\n{table_2(plan)}\n")
     if read_shapes(plan):
         print(f"Table 3, d(I, T) in mean leaf lengths: {table_3(plan)}\n")
@@ -55,23 +54,15 @@ def printed_cells(values: Sequence[float | None], plan: Plan, decimals: int) -> 
 def read_matches(plan: Plan, kind: str) -> dict[str, list[Record]]:
     """{method: records} of table 1, for one kind of masks."""
     specs = list_cells(PRESETS[plan.preset])
-    by_method = {method: read_records(plan.match_records(kind) / slug(method), specs) for method in plan.methods}
+    by_method = {method: read_records(plan.match_records(kind) / slug(method), specs) for method in METHODS}
     return {method: records for method, records in by_method.items() if records}
 
 
-def read_shapes(plan: Plan, names: Iterable[str] = tuple(SHAPES)) -> dict[str, list[Record]]:
-    """{shape: records} of table 3 for those of the names that were run, restricted to the scenes that they share."""
-    specs = [spec for spec in list_cells(PRESETS[plan.preset]) if plant_index(spec) < plan.shape_plants]
-    wanted = [name for name in names if name in plan.shapes]
-    by_shape = {name: read_records(plan.records / "shapes" / slug(name), specs) for name in wanted}
-    return shared_scenes({name: records for name, records in by_shape.items() if records})
-
-
-def shared_scenes(groups: dict[str, list[Record]]) -> dict[str, list[Record]]:
-    """The records of the scenes that all groups share, so that an interrupted run, too, compares the same scenes."""
-    names = [{record["scene"] for record in records} for records in groups.values()]
-    shared = set.intersection(*names) if names else set()
-    return {name: [record for record in records if record["scene"] in shared] for name, records in groups.items()}
+def read_shapes(plan: Plan) -> dict[str, list[Record]]:
+    """{shape: records} of table 3."""
+    specs = list_cells(PRESETS[plan.preset])
+    by_shape = {name: read_records(plan.records / "shapes" / slug(name), specs) for name in SHAPES}
+    return {name: records for name, records in by_shape.items() if records}
 
 
 def row_name(method: str, records: Sequence[Record]) -> str:
@@ -85,20 +76,14 @@ def table_1(plan: Plan, kind: str) -> str:
     """Every measure of every method, per number of cameras and leaves; the paper's rows, in italics, once: in the
     table of true masks."""
     views, leaves = axes(plan)
-    matches = read_matches(plan, kind)
-    most = max(len(records) for records in matches.values())
     rows = []
     for name, (key, decimals) in MEASURES.items():
-        beside = set()
-        for method, records in matches.items():
+        for method, records in read_matches(plan, kind).items():
             columns = average_columns(records, measure(key), views=views, leaves=leaves)
-            label = row_name(method, records) + (f", {len(records)} scenes" if len(records) < most else "")
-            rows.append([name, label, *(column.text(decimals) for column in columns)])
-            beside.add(PRINTED[method])
+            rows.append([name, row_name(method, records), *(column.text(decimals) for column in columns)])
         for method, values in (printed.TABLE_1.get(name, {}) if kind == "true" else {}).items():
-            if method in beside:
-                digits = 3 if name == "s_match" else 2
-                rows.append([name, f"*paper: {method}*", *printed_cells(values, plan, digits)])
+            digits = 3 if name == "s_match" else 2
+            rows.append([name, f"*paper: {method}*", *printed_cells(values, plan, digits)])
     header = ["measure", "method", *(f"{n} cams" for n in views), *(f"{n} leaves" for n in leaves), "average"]
     return markdown_table(header, rows)
 
@@ -118,7 +103,7 @@ def table_2(plan: Plan) -> str:
     """Every method on every real scene; the paper's own plant for orientation."""
     rows = []
     for folder in plan.real:
-        for method in plan.methods:
+        for method in METHODS:
             path = real_record(plan, folder, method)
             if path.is_file():
                 record = read_record(path)
@@ -146,8 +131,8 @@ def table_3(plan: Plan) -> str:
         ("MVIS", "MVIS (nview), true masks, hidden parts", DEFAULT_SHARE),
         ("MVIS", "MVIS (nview), degraded masks, hidden parts", DEFAULT_SHARE),
     ]
-    shapes = read_shapes(plan, [name for _, name, _ in wanted])
-    rows, last = [], None
+    shapes, last = read_shapes(plan), None
+    rows = []
     for paper, name, threshold in wanted:
         if paper != last:
             cells = printed_cells(printed.TABLE_3[paper], plan, 3)
@@ -158,15 +143,7 @@ def table_3(plan: Plan) -> str:
             label = name + (f" {threshold}" if "hidden" in name else "")
             rows.append([row_name(label, shapes[name]), *(column.text(3) for column in columns[:-1])])
     header = ["method", *(f"{n} cams" for n in views), *(f"{n} leaves, {at} cams" for n in leaves)]
-    return f"{count_scenes(shapes, plan)}\n\n{markdown_table(header, rows)}"
-
-
-def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
-    """One sentence: how many scenes a table shows, out of how many when everything has been run."""
-    asked = sum(plant_index(spec) < plan.shape_plants for spec in list_cells(PRESETS[plan.preset]))
-    done = len(next(iter(groups.values()), []))
-    caution = "" if done == asked else " The others have not been run yet: columns do not show the same plants."
-    return f"{done} of {asked} scenes.{caution}"
+    return f"{len(next(iter(shapes.values())))} scenes.\n\n{markdown_table(header, rows)}"
 
 
 def table_rules(plan: Plan) -> str:
@@ -177,8 +154,7 @@ def table_rules(plan: Plan) -> str:
         ("share of the masks", "degraded", "MVIS (nview), degraded masks"),
         ("hidden parts", "degraded", "MVIS (nview), degraded masks, hidden parts"),
     ]
-    shapes = read_shapes(plan, [name for _, _, name in wanted])
-    rows = []
+    shapes, rows = read_shapes(plan), []
     for rule, kind, name in wanted:
         if name in shapes:
             for threshold in THRESHOLDS:
@@ -186,7 +162,7 @@ def table_rules(plan: Plan) -> str:
                 cells = [average(shapes[name], measure(text, key)).text(3) for key in HALVES]
                 rows.append([kind, rule, f"> {text}", *cells])
     table = markdown_table(["masks", "rule", "threshold", *HALVES], rows)
-    return f"{count_scenes(shapes, plan)}\n\n{table}"
+    return f"{len(next(iter(shapes.values())))} scenes.\n\n{table}"
 
 
 def table_numbers(plan: Plan) -> str:

@@ -17,12 +17,11 @@ from mvseg.batch.work import Finished, work_on_scene
 from mvseg.batch.workers import Engine, Lost, run_locally
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
+from mvseg.findings.finding import list_some
 from mvseg.results.earlier import Output, check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 from mvseg.system.running import progress_bar
 from mvseg.system.say import say
-
-SHOWN = 4  # limit: names of running scenes beside the progress bar
 
 
 @dataclass(frozen=True)
@@ -114,8 +113,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
     running: dict[int, str] = {}  # in the order in which they began
 
     def show() -> None:
-        more = f" and {len(running) - SHOWN} more" if len(running) > SHOWN else ""
-        bar.beside = "".join(f", {name}" for name in list(running.values())[:SHOWN]) + more
+        bar.beside = f", {list_some(list(running.values()))}" if running else ""
         bar.update(0)
 
     def start(index: int) -> None:

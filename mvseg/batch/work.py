@@ -117,22 +117,19 @@ def scene_key(scene: Scene, request: RunRequest) -> str:
 
     It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
     reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
-    files. Hidden files are ignored. Raises InputError if a file cannot be read, or the weights are not there.
+    files. Hidden files are ignored. Raises OSError if a file cannot be read, InputError if the weights are not there.
     """
     options, masks = asdict(request.config), request.masks
-    try:
-        if masks is None:
-            from mvseg.detectors.zoo import weights_path  # loads torchvision
+    if masks is None:
+        from mvseg.detectors.zoo import weights_path  # loads torchvision
 
-            options["detect"]["weights"] = None  # their hash counts, not their name
-            others: Any = hash_files(Path(weights_path(request.config.detect.weights)))
-        else:
-            del options["detect"]
-            others = [_describe_file(path, masks) for path in _mask_files(masks)]
-        edits = None if request.corrections is None else hash_files(request.corrections)
-        photos = [_describe_file(view.path, view.path.parent) for view in scene.views if view.path.is_file()]
-    except OSError as error:
-        raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
+        options["detect"]["weights"] = None  # their hash counts, not their name
+        others: Any = hash_files(Path(weights_path(request.config.detect.weights)))
+    else:
+        del options["detect"]
+        others = [_describe_file(path, masks) for path in _mask_files(masks)]
+    edits = None if request.corrections is None else hash_files(request.corrections)
+    photos = [_describe_file(view.path, view.path.parent) for view in scene.views if view.path.is_file()]
     told = [code_hash(), _describe_scene(scene), photos, others, edits, options]
     return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()
 

@@ -11,12 +11,10 @@ import numpy as np
 from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError
 from mvseg.findings.finding import Finding, Rule, Values, list_findings
-from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
-from mvseg.formats.photos import PhotoContent, Photos, measure_content, photo_bits, photos_in
+from mvseg.formats.image_file import is_turned, read_exposure, read_image_size
+from mvseg.formats.photos import PhotoContent, Photos, photos_in
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
-
-NOTHING = PhotoContent(contrast=0.0, level=0.0, burnt=0.0, grey=False)
 
 
 @dataclass(frozen=True)
@@ -27,19 +25,15 @@ class PhotoFacts:
         size: width and height as stored; None for a photo that is missing or cannot be read.
         problem: why it cannot be read; "" otherwise, also for a missing one.
         turned: EXIF asks viewers to turn it.
+        content: None if no stage can use it.
     """
 
     size: tuple[int, int] | None = None
     problem: str = ""
     turned: bool = False
-    content: PhotoContent = NOTHING
+    content: PhotoContent | None = None
     digest: str = ""
     exposure: float = math.nan
-
-    @property
-    def is_blank(self) -> bool:
-        """Whether it has one colour all over. A dark photo of a plant has little contrast, too."""
-        return self.content.contrast < max(IMAGES.rounding, min(IMAGES.blank, IMAGES.blank_share * self.content.level))
 
 
 def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
@@ -78,12 +72,12 @@ def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
 
 
 def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
-    whole = [view for view, each in enumerate(facts) if each.size is not None]
-    blank = [view for view in whole if facts[view].is_blank]
-    contents = {view: facts[view].content for view in whole if view not in blank}
+    contents = {view: each.content for view, each in enumerate(facts) if each.content is not None}
+    blank = [view for view, each in contents.items() if _is_blank(each)]
+    contents = {view: each for view, each in contents.items() if view not in blank}
     same: dict[str, list[int]] = defaultdict(list)
-    for view in whole:
-        same[facts[view].digest].append(view)
+    for view, each in enumerate(facts):
+        same[each.digest or str(view)].append(view)
     return [
         ("blank_photo", "error", blank, {}),
         ("dark_photo", "warning", [view for view, each in contents.items() if each.level < IMAGES.dark], {}),
@@ -91,6 +85,11 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
         ("grey_photo", "note", [view for view, each in contents.items() if each.grey], {}),
         *(("same_photo", "error", views, {}) for views in same.values() if len(views) > 1),
     ]
+
+
+def _is_blank(content: PhotoContent) -> bool:
+    """Whether a photo has one colour all over. A dark photo of a plant has little contrast, too."""
+    return content.contrast < max(IMAGES.rounding, min(IMAGES.blank, IMAGES.blank_share * content.level))
 
 
 def _exposure_rules(facts: list[PhotoFacts]) -> list[Rule]:
@@ -108,10 +107,7 @@ def _read_facts(photos: Photos, view: int) -> PhotoFacts:
         return PhotoFacts()
     try:
         size = read_image_size(path)
-        if size == tuple(scene.cameras.sizes[view].tolist()):
-            content = photos.content(view)
-        else:  # no stage can use it
-            content = measure_content(read_rgb(path, bits=photo_bits(scene, view)))
+        content = photos.content(view) if size == tuple(scene.cameras.sizes[view].tolist()) else None
     except InputError as error:
         return PhotoFacts(problem=str(error.__cause__ or error))  # the reason alone
     turned, exposure = is_turned(path), read_exposure(path)

@@ -109,12 +109,10 @@ def _parse(arguments: Sequence[str]) -> Namespace:
             if "\0" in str(value):  # a YAML file can hold one
                 raise InputError(f"{name} is {str(value)!r}, expected text without null characters")
         return args
-    except (UnicodeDecodeError, RecursionError) as error:  # of a file that an option names
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # no UTF-8, a number of thousands of digits
         raise InputError(f"the options cannot be read ({error})") from None
-    except ValueError as error:
-        if isinstance(error, InputError) or "integer string conversion" not in str(error):
-            raise
-        raise InputError("an option is a number of thousands of digits") from None
 
 
 def build_parser(*, short: bool = False) -> ArgumentParser:

@@ -9,7 +9,6 @@ from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.errors import InputError
 from mvseg.system.say import say
 
 
@@ -39,17 +38,13 @@ def run(args: Namespace) -> int:
     metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
     agreement = compare_annotators(regions, ids, truth)
     metrics |= {"alone": agreement.alone, "missed": agreement.missed}
-    metrics |= {f"iou_{each.leaf}_{each.true}": each.iou for each in agreement.shared}
+    metrics |= {f"iou_{leaf}_{other}": iou for leaf, other, iou in agreement.shared}
     if metrics["no_instance"]:
         message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: left out of the scores of the ids"
         say(f"mvseg: warning: {message}", to_stderr=True)
     for name, value in metrics.items():
         shown = ",".join(map(str, value)) or "none" if isinstance(value, tuple) else value
         say(f"{name:18} {shown:.4f}" if isinstance(shown, float) else f"{name:18} {shown}")
-    if not (result / "instances.json").is_file():  # labels of somebody
-        return 0
-    try:
+    if (result / "instances.json").is_file():  # not labels of somebody
         write_text_whole(result / "metrics.json", json.dumps(metrics, indent=1) + "\n")
-    except OSError as error:
-        raise InputError(f"{result}: cannot write metrics.json ({error.strerror})") from None
     return 0

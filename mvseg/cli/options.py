@@ -151,14 +151,10 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def read_up(up: str | list[float] | None) -> Up | None:
+def read_up(up: Any) -> Up | None:
     """Read --up: three numbers, "rig", "board", or nothing. Raises InputError for anything else."""
-    if up is None:
-        return None
-    if up == "rig":
-        return "rig"
-    if up == "board":
-        return "board"
+    if up in (None, "rig", "board"):
+        return up
     words = up.replace(",", " ").split() if isinstance(up, str) else [str(number) for number in up]
     if len(words) != 3 or not all(_is_number(word) for word in words):
         raise InputError(f"up is '{' '.join(words)}', expected three numbers, as in 0 0 1, rig or board")

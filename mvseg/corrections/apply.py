@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,13 +26,13 @@ from mvseg.corrections.corrected import (
     Whole,
     keep_latest,
 )
-from mvseg.corrections.edited_mask import EditedMask, Key, as_table, hang_together, side_of
+from mvseg.corrections.edited_mask import EditedMask, Key, as_table, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, topic_of
 from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
-from mvseg.formats.find_views import find_views
+from mvseg.formats.find_views import find_view
 from mvseg.formats.lens import pinhole_from_photo, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
@@ -144,7 +143,6 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     table = replace(as_table(masks, order), is_linked=is_linked)
     if len(links.must):
         component = links.components(len(order))
-        edited = _tell_of_parts(edited, order, component, scene)
         first = np.unique(component, return_index=True)[1]
         table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
@@ -290,40 +288,24 @@ def _ties_of_words(words: Sequence[tuple[str, int, Key]], place: Mapping[Key, in
     return ties
 
 
-def _tell_of_parts(edited: _Edited, masks: Sequence[EditedMask], component: NDArray[np.int64], scene: Scene) -> _Edited:
-    """Find masks of one photo that edits make one leaf, but that do not touch; the last of these edits reports it."""
-    group_of = {mask.key: int(group) for mask, group in zip(masks, component, strict=True)}
-    groups: dict[tuple[int, int], list[EditedMask]] = {}
-    for mask in masks:
-        groups.setdefault((group_of[mask.key], mask.view), []).append(mask)
-    for (group, view), parts in groups.items():
-        edits = [tie.edit for tie in edited.ties if tie.must and group_of.get(tie.one) == group]
-        if edits and not hang_together(parts):
-            message = f"a contradiction: its masks in view {scene.views[view].name} do not touch"
-            edited = edited.with_fate(replace(edited.fates[max(edits)], problem=message))
-    return edited
-
-
 def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited, Links]:
     """The links that hold, of rows, see `keep_latest`."""
     ties = [each for each in edited.ties if each.one in place and each.other in place]
 
-    def links_of(edits: Collection[int]) -> Links | None:
-        said = [each for each in ties if each.edit in edits]
-        must, cannot = (
-            [(place[each.one], place[each.other]) for each in said if each.must is kind] for kind in (True, False)
-        )
-        links = Links.of(must, cannot)
-        with suppress(InputError):
-            links.components(len(place))
-            return links
-        return None
+    def links_of(edits: Collection[int]) -> Links:
+        chosen = [(each.must, (place[each.one], place[each.other])) for each in ties if each.edit in edits]
+        return Links.of(*([pair for must, pair in chosen if must is kind] for kind in (True, False)))
 
-    edits = sorted({each.edit for each in ties}, reverse=True)
-    held, losers = keep_latest(edits, lambda chosen: links_of(chosen) is not None)
+    def agree(edits: Collection[int]) -> bool:
+        with suppress(InputError):
+            links_of(edits).components(len(place))
+            return True
+        return False
+
+    held, losers = keep_latest(sorted({each.edit for each in ties}, reverse=True), agree)
     for number, winner in losers.items():
         edited = edited.contradict(winner, [number])
-    return edited, links_of(held) or Links.of()
+    return edited, links_of(held)
 
 
 def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
@@ -371,11 +353,9 @@ def _pixel_at(scene: Scene, place: Place) -> tuple[int, int, int]:
 
 
 def _view(scene: Scene, name: str) -> int:
-    with suppress(InputError):  # it fits several
-        (view,) = find_views([name], scene, source=Path("corrections"))
-        if view is not None:
-            return view
-    raise _Lost(f"there is no view {name[:60]!r}")
+    if (view := find_view(name, scene)) is None:
+        raise _Lost(f"there is no view {name[:60]!r}")
+    return view
 
 
 def _to_pinhole(scene: Scene, view: int, points: Sequence[Point]) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""One mask while edits are applied to it: where a line cuts it, what it touches, and the table of those left."""
+"""One mask while edits are applied to it: where a line cuts it, and the table of the masks after all edits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from mvseg.corrections.numbers import EDITS
@@ -46,22 +45,6 @@ def side_of(line: NDArray[np.float64], crop: Crop) -> Tensor:
     side = np.zeros((height, width), np.uint8)
     cv2.fillPoly(side, [np.round(polygon * 2**EDITS.fine).astype(np.int32)], 1, shift=EDITS.fine)
     return torch.from_numpy(side > 0)
-
-
-def hang_together(masks: Sequence[EditedMask]) -> bool:
-    """Do masks of one view touch, or nearly, so that one can go from each to all others?"""
-    touching = np.array([[touch(mask.crop, other.crop) for other in masks] for mask in masks])
-    return connected_components(touching, directed=False)[0] == 1
-
-
-def touch(one: Crop, other: Crop) -> bool:
-    """Do two masks of one view touch, or nearly?"""
-    x1, y1, x2, y2 = one.union(other).box
-    gap = EDITS.touches_px
-    around = (x1 - gap, y1 - gap, x2 + gap, y2 + gap)
-    kernel = np.ones((2 * gap + 1, 2 * gap + 1), np.uint8)
-    near = cv2.dilate(one.within(around).pixels.numpy().astype(np.uint8), kernel)
-    return bool((near & other.within(around).pixels.numpy()).any())
 
 
 def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:

@@ -1,6 +1,6 @@
 """The numbers of corrections: definitions, technical limits, and thresholds that only sort and propose.
 
-`python benchmarks/corrections.py` measures what the page's questions and the user's own edits gain with them.
+`python -m benchmarks.corrections` measures what the page's questions and the user's own edits gain with them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ class EditNumbers:
     touches: float = 0.02  # chosen: distance of the surfaces of two halves, in lengths of the first
     as_near: float = 1.1  # chosen: max. distance of the outline of one surface that fits as well as two, in theirs
     fine: int = 4  # limit: bits of a pixel's fraction, along a cut
-    touches_px: int = 2  # chosen: max. gap between two masks of one leaf in one photo, where they hang together
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
     around: float = 0.35  # chosen: margin around the rough outline that is part of it, as a share of its size
     least_margin_px: float = 4.0  # chosen: the same in pixels of the photo, at least

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
 from mvseg.corrections.file import Corrections, Edit, Link, PhotoMark, TrackLink
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding
-from mvseg.formats.find_views import find_views
+from mvseg.formats.find_views import find_view, find_views
 from mvseg.formats.photos import Photos
 from mvseg.scene import Scene
 
@@ -35,13 +34,8 @@ def with_marks(corrections: Corrections, scene: Scene, marks: Mapping[str, Photo
 def named_views(corrections: Corrections, scene: Scene) -> list[int]:
     """The indices of the views that edits of single scenes name, each once; names that fit no view, or several, are
     left to `apply`."""
-    views: dict[int, None] = {}
-    for name in views_of(corrections):
-        with suppress(InputError):  # it fits several
-            (view,) = find_views([name], scene, source=Path("corrections"))
-            if view is not None:
-                views[view] = None
-    return list(views)
+    views = (find_view(name, scene) for name in views_of(corrections))
+    return list(dict.fromkeys(view for view in views if view is not None))
 
 
 def views_of(corrections: Corrections) -> list[str]:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from mvseg.corrections.corrected import keep_latest
 from mvseg.corrections.file import Edit, TrackLink
-from mvseg.formats.find_views import base_name
+from mvseg.formats.find_views import LonePhotos, find_view
 from mvseg.formats.label_png import read_labels
+from mvseg.scene import View
 
 
 @dataclass(frozen=True)
@@ -83,21 +84,13 @@ def leaf_at(folder: Path, view: str, x: float, y: float) -> int:
     The view is named as in a single scene (`find_views`): with its folders, or without them if no other one is named
     so; with or without the suffix of its photo.
     """
-    path = _find_labels(folder / "labels", view)
-    if path is None:
+    paths = [*(folder / "labels").rglob("*.png")]
+    names = (path.relative_to(folder / "labels").as_posix().removesuffix(".png") for path in paths)
+    if (place := find_view(view, LonePhotos(tuple(map(View, names, paths))))) is None:
         return 0
-    labels, column, row = read_labels(path), int(x // 1), int(y // 1)
+    labels, column, row = read_labels(paths[place]), int(x // 1), int(y // 1)
     is_inside = 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1]
     return int(labels[row, column]) if is_inside else 0
-
-
-def _find_labels(folder: Path, view: str) -> Path | None:
-    labels_of = {path.relative_to(folder).as_posix().removesuffix(".png"): path for path in folder.rglob("*.png")}
-    name = view.replace("\\", "/").removeprefix("./")
-    if (exact := labels_of.get(name, labels_of.get(name.rsplit(".", 1)[0]))) is not None:
-        return exact
-    alike = [path for of, path in labels_of.items() if base_name(of) == base_name(name)]
-    return alike[0] if len(alike) == 1 else None
 
 
 def _with_full_names(edit: TrackLink, scenes: Sequence[str]) -> tuple[TrackLink, list[tuple[str, list[str]]]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -51,7 +53,7 @@ def ruzicka_similarity(
     instance_ids: Tensor,
     *,
     cameras: Cameras,
-    max_pixels: int | None = None,
+    max_pixels: float = math.inf,
 ) -> Tensor:
     """Ruzicka similarity of every proposal's mask with every instance's epipolar map in its view (Eqs. 4, 5).
 
@@ -60,7 +62,7 @@ def ruzicka_similarity(
 
     Args:
         instance_ids: (D,) int64 in [1, K] or -1.
-        max_pixels: thins the masks of the proposals; None takes all pixels.
+        max_pixels: thins the masks of the proposals.
 
     Returns:
         (R, K) float32 in [0, 1], the first column for id 1; 0 where an instance has no region in another view: those of

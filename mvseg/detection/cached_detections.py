@@ -105,12 +105,10 @@ def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterat
         with lock_folder(folder):
             try:
                 owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
-                earlier = owner.read_bytes() if owner.is_file() else b"" if _holds_some(folder) else place
+                earlier = owner.read_bytes() if owner.is_file() else place
                 if earlier != place and not overwrite:
-                    other, why = os.fsdecode(earlier), "holds detections, but not of which photos"
-                    if other:
-                        why = f"keeps what a run that was cut off found in the photos of {other}, not of {scene}"
-                    raise InputError(f"{folder}: {why}; expected another --out, or --overwrite true")
+                    why = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}"
+                    raise InputError(f"{folder}: {why}, not of {scene}; expected another --out, or --overwrite true")
                 write_whole(owner, lambda partial: partial.write_bytes(place))
                 yield _holds_some(folder)
             finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Mapping
 from functools import partial
 
 import torch
@@ -10,7 +10,8 @@ from torch import Tensor
 
 from mvseg.detection.assignment import EpipolarAssignment
 from mvseg.detection.nms import backed_by_views, cluster_aware_nms
-from mvseg.errors import warn
+from mvseg.errors import collect_warnings, warn
+from mvseg.findings.finding import Finding
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
@@ -49,29 +50,28 @@ def match_proposals(
     boxes = proposals.regions.boxes.float() if boxes is None else boxes
     suppress = partial(_suppress, proposals, boxes, cluster_iou, detections_per_view=detections_per_view)
     per_class = torch.stack((proposals.view_index, proposals.classes), 1)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        keep = suppress(per_class)
-        matching = match_masks(proposals.select(keep), cameras, match, residual_px=residual_px)
-        counts = _count_instances(matching.masks) if match.resolved_method == "symnmf" else {}
-        residual_px = matching.report.residual_px  # of the poses, which stay the same
-        rematch = partial(match_masks, cameras=cameras, config=match, num_instances=counts, residual_px=residual_px)
-        for _ in range(num_iterations):
-            matched = matching.masks
-            ids, _ = assignment(proposals.regions, matched.regions, matched.instance_ids, cameras=cameras)
-            groups = torch.cat((per_class, ids[:, None]), 1)
-            keep = suppress(groups)
-            caught.clear()
-            matching = rematch(proposals.select(keep))
-        if num_iterations and matching.report.has_probabilities:
-            ids, scores = matching.instance_ids, matching.match_scores
-            stays = backed_by_views(boxes[keep], per_class[keep], ids, match_scores=scores, iou_threshold=cluster_iou)
-            if not stays.all():
-                caught.clear()
-                matching = rematch(proposals.select(keep[stays]))
-    for each in caught:
-        if isinstance(each.message, Warning):
-            warn(each.message)
+
+    def match_some(rows: Tensor, residual_px: int | None, counts: Mapping[int, int]) -> tuple[Matching, list[Finding]]:
+        chosen = proposals.select(rows)
+        with collect_warnings() as findings:
+            return match_masks(chosen, cameras, match, num_instances=counts, residual_px=residual_px), findings
+
+    keep = suppress(per_class)
+    matching, findings = match_some(keep, residual_px, {})
+    counts = _count_instances(matching.masks) if match.resolved_method == "symnmf" else {}
+    residual_px = matching.report.residual_px  # of the poses, which stay the same
+    for _ in range(num_iterations):
+        matched = matching.masks
+        ids, _ = assignment(proposals.regions, matched.regions, matched.instance_ids, cameras=cameras)
+        keep = suppress(torch.cat((per_class, ids[:, None]), 1))
+        matching, findings = match_some(keep, residual_px, counts)
+    if num_iterations and matching.report.has_probabilities:
+        ids, scores = matching.instance_ids, matching.match_scores
+        stays = backed_by_views(boxes[keep], per_class[keep], ids, match_scores=scores, iou_threshold=cluster_iou)
+        if not stays.all():
+            matching, findings = match_some(keep[stays], residual_px, counts)
+    for each in findings:
+        warn(each)
     return matching
 
 

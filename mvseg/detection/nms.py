@@ -58,8 +58,6 @@ def backed_by_views(
     Returns:
         (S,) bool. A discarded box does not count as a better one for the rest.
     """
-    if not len(boxes):
-        return torch.ones(0, dtype=torch.bool, device=boxes.device)
     _, group = groups.unique(dim=0, return_inverse=True)
     overlaps = (torchvision.ops.box_iou(boxes, boxes) > iou_threshold) & (group[:, None] == group)
     is_other = (instance_ids[:, None] != instance_ids) & ((instance_ids > 0) & (match_scores >= SURE))[:, None]

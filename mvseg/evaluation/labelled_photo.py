@@ -47,7 +47,10 @@ def label_photo(photo: np.ndarray, labels: np.ndarray) -> LabelledPhoto:
 def mask_photo(
     photo: np.ndarray, masks: Sequence[np.ndarray], *, classes: Sequence[int], ignore: np.ndarray
 ) -> LabelledPhoto:
-    """A photo (H, W, 3) uint8 RGB with the instances of N masks (H, W) bool, which may overlap, and their N classes."""
+    """A photo (H, W, 3) uint8 RGB with the instances of N masks (H, W) bool, which may overlap, and their N classes. No
+    pixel of theirs is ignored, whatever covers it."""
+    for mask in masks:
+        ignore = ignore & ~mask
     return LabelledPhoto(
         photo=_channels_first(photo),
         layers=stack_layers(masks, ignore.shape),

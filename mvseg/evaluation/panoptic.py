@@ -183,26 +183,18 @@ def count_shared_pairs(masks: SegmentMatches, ids: np.ndarray, leaf: np.ndarray)
 
 
 @dataclass(frozen=True)
-class SharedLeaf:
-    """A leaf that both have: its ids, and the IoU of all its pixels in all views, above 0.5."""
-
-    leaf: int
-    true: int
-    iou: float
-
-
-@dataclass(frozen=True)
 class Agreement:
     """Agreement of two annotators of the same photos.
 
     Attributes:
-        shared: leaves that both have, by the first's ids.
+        shared: leaves that both have: id of the first, id of the second, and the IoU of all their pixels in all views,
+            above 0.5; by the first's ids.
         alone: ids of leaves, ascending, that only the first has, but those that the second ignores; masks without an
             id are none.
         missed: ids of leaves that only the second has.
     """
 
-    shared: tuple[SharedLeaf, ...]
+    shared: tuple[tuple[int, int, float], ...]
     alone: tuple[int, ...]
     missed: tuple[int, ...]
 
@@ -212,11 +204,9 @@ def compare_annotators(regions: Regions, instance_ids: Tensor, truth: Sequence[n
     `leaf_metrics`. Exchanged, they have the same shared leaves, as long as masks of one view do not overlap."""
     judged = find_all(regions, instance_ids, truth)
     leaves = zip(judged.ids.tolist(), judged.leaves.true_segment.tolist(), judged.leaves.iou.tolist(), strict=True)
-    shared = tuple(
-        SharedLeaf(leaf, judged.labels[true], iou) for leaf, true, iou in sorted(leaves) if leaf > 0 and true >= 0
-    )
+    shared = tuple((leaf, judged.labels[true], iou) for leaf, true, iou in sorted(leaves) if leaf > 0 and true >= 0)
     return Agreement(
         shared=shared,
         alone=tuple(leaf for leaf in judged.ids[judged.leaves.is_false].tolist() if leaf > 0),
-        missed=tuple(label for label in judged.labels if label not in {each.true for each in shared}),
+        missed=tuple(label for label in judged.labels if label not in {true for _, true, _ in shared}),
     )

@@ -110,8 +110,6 @@ def _check_binary_model(model: Path) -> None:
                 for _ in range(_number(data, 0, "<Q")):
                     end = record_end(data, end)
                 is_whole = end == len(data)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
         except KeyError as number:
             raise InputError(f"{path}: camera model number {number} is not known") from None
         except (struct.error, ValueError, IndexError, OverflowError):  # beyond the end, or no byte at all

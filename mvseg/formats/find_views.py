@@ -6,6 +6,7 @@ import re
 import unicodedata
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -66,6 +67,13 @@ def find_views(
         first = f"{name} for {scene.views[view].name}"
         warn(Finding("base_names", str(source), {"count": len(first_of), "first": first}))
     return view_indices
+
+
+def find_view(name: str, photos: PhotoSet) -> int | None:
+    """The view that one file name refers to, see `find_views`; None where it refers to none, or fits several."""
+    with suppress(InputError):
+        return find_views([name], photos, source=None)[0]
+    return None
 
 
 def base_name(name: str) -> str:

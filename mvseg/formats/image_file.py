@@ -53,19 +53,15 @@ READERS: tuple[tuple[bytes, type[ImageFile]], ...] = (
 
 
 class WrongSize(InputError):
-    """An image of `width` x `height` pixels where another size was expected."""
-
-    def __init__(self, width: int, height: int) -> None:
-        super().__init__(f"it is {width} x {height}")
-        self.width, self.height = width, height
+    """An image of another size than its camera has; the message begins with its own: "640 x 480, its camera ..."."""
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """Decode a JPEG, PNG, TIFF, BMP, WebP or HEIC file, recognised by its content, into one of Pillow's modes; the
-    first image of several. One whose sides are not those of `size`, in either order, is not decoded.
+    first image of several.
 
     Raises:
-        WrongSize: an image of another size.
+        WrongSize: it is not of `size` (width, height), as stored; it is not decoded.
         InputError: the file cannot be opened, is no such image, is cut short or damaged, or has more than 2^28 pixels.
             The message is a reason, without the file's name.
     """
@@ -79,10 +75,12 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         if reader is PngImageFile:
             _verify(data)
         image = _open(reader, data)
-        if size is not None and sorted(image.size) != sorted(size):  # a TIFF may be turned when it is decoded
-            raise WrongSize(image.width, image.height)
-        if image.width * image.height > MAX_PIXELS:
-            raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
+        width, height = _stored_size(image)
+        if size is not None and (width, height) != size:
+            turned = " (as it is stored; EXIF turns it for display)" if _orientation_of(image) != 1 else ""
+            raise WrongSize(f"{width} x {height}{turned}, its camera says {size[0]} x {size[1]}")
+        if width * height > MAX_PIXELS:
+            raise InputError(f"it is {width} x {height} pixels, expected at most {MAX_PIXELS} in all")
         turn = _orientation_of(image) if _is_turned_by_decoder(image) else 1
         image.load()
         return _turn_back(image, turn) if turn > 1 else image
@@ -121,8 +119,11 @@ def _turn_back(image: ImageFile, turn: int) -> Image.Image:
 def read_image_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, as stored, by the header. Raises InputError as `read_image`, as far as that shows."""
     with _any_fault(), path.open("rb") as file:
-        image = _find_reader(file)(file)
-        is_swapped = _is_turned_by_decoder(image) and _orientation_of(image) >= 5  # as it will be turned
+        return _stored_size(_find_reader(file)(file))
+
+
+def _stored_size(image: ImageFile) -> tuple[int, int]:
+    is_swapped = _is_turned_by_decoder(image) and _orientation_of(image) >= 5  # as it will be turned
     return image.size[::-1] if is_swapped else image.size
 
 

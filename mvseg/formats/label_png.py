@@ -44,11 +44,8 @@ def open_labels(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         raise InputError(f"{path}: the mask file is missing")
     try:
         image = read_image(path, size)
-        if size is not None and image.size != size:
-            raise WrongSize(image.width, image.height)
     except WrongSize as error:
-        expected = "" if size is None else f", its camera says {size[0]} x {size[1]}"
-        raise InputError(f"{path}: the mask is {error.width} x {error.height}{expected}") from None
+        raise InputError(f"{path}: the mask is {error}") from None
     except InputError as error:
         raise InputError(f"{path}: cannot be read, expected a whole label PNG: {error}") from None
     if image.format == "JPEG":

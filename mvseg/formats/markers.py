@@ -5,6 +5,8 @@ OpenCV has the centre of the top-left pixel at (0, 0); here it is at (0.5, 0.5),
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -33,9 +35,9 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
     return markers
 
 
-def find_scene_markers(photos: Photos) -> dict[Family, Seen]:
-    """Corners of the markers in all photos of a scene, by family. Raises InputError if one is missing or broken."""
-    markers: dict[Family, Seen] = {family: {} for family in FAMILIES}
+def find_scene_markers(photos: Photos, families: Sequence[Family] = FAMILIES) -> dict[Family, Seen]:
+    """Corners of the markers in all photos of a scene, by family. Raises InputError if a photo is missing or broken."""
+    markers: dict[Family, Seen] = {family: {} for family in families}
     for view in progress_bar(range(len(photos.scene.views)), name="markers", unit="photo"):
         photo = read_grey(photos, view)
         for family, seen in markers.items():

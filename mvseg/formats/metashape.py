@@ -61,6 +61,7 @@ def read_metashape(path: Path) -> Scene:
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     with faults_of(path):
         world_from_chunk = _find_transform(path, chunk)
+    turn, shift, scale = world_from_chunk or (np.eye(3), np.zeros(3), 1.0)
     cameras = {camera.get("id"): camera for camera in chunk.iterfind(CAMERAS)}
     photos, num_left_out, slaves = [], 0, []
     for index, camera in enumerate(chunk.iterfind(CAMERAS)):
@@ -75,8 +76,9 @@ def read_metashape(path: Path) -> Scene:
             elif world_from_chunk is not None and offset[:3, 3].any():
                 slaves.append(label)
             else:
-                poses = {"chunk_from_cam": chunk_from_master @ offset, "world_from_chunk": world_from_chunk}
-                photos.append(_photo(path.parent, label, sensor, **poses))
+                chunk_from_cam = chunk_from_master @ offset
+                R, center = turn @ chunk_from_cam[:3, :3], scale * turn @ chunk_from_cam[:3, 3] + shift
+                photos.append(_photo(path.parent, label, sensor, R=R, center=center))
     if num_left_out:
         warn(Finding("cameras_not_aligned", str(path), {"count": num_left_out}))
     if slaves:
@@ -137,24 +139,14 @@ def _read_offset(sensor: ElementTree.Element | None) -> np.ndarray:
     return master_from_slave
 
 
-def _photo(
-    folder: Path,
-    label: str,
-    sensor: ElementTree.Element | None,
-    *,
-    chunk_from_cam: np.ndarray,
-    world_from_chunk: tuple[np.ndarray, np.ndarray, float] | None,
-) -> Photo:
+def _photo(folder: Path, label: str, sensor: ElementTree.Element | None, *, R: np.ndarray, center: np.ndarray) -> Photo:
+    """A photo whose camera has the rotation world_from_cam, `R`, and stands at `center`."""
     if sensor is None:
         raise InputError("its sensor is not in the file")
     width, height, values = _read_sensor(sensor)
     f, cx, cy, b1, b2, k1, k2, k3, p1, p2 = (values[name] for name in NAMES)
     K = np.array([[f + b1, b2, width / 2 + cx], [0, f, height / 2 + cy], [0, 0, 1]])
     lens = opencv_lens(K, [k1, k2, p2, p1, k3], width=width, height=height)
-    R, center = chunk_from_cam[:3, :3], chunk_from_cam[:3, 3]
-    if world_from_chunk is not None:
-        turn, shift, scale = world_from_chunk
-        R, center = turn @ R, scale * turn @ center + shift
     file = find_photo(folder, f"images/{label}")
     return Photo(file=file, width=width, height=height, K=K, R=R.T, t=-R.T @ center, lens=lens)
 

@@ -317,15 +317,9 @@ def read_stored(scene: Scene, view: int) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
     try:
-        pixels = read_rgb(path, (width, height), bits=photo_bits(scene, view))
-        if pixels.shape[:2] != (height, width):
-            raise WrongSize(pixels.shape[1], pixels.shape[0])
+        return read_rgb(path, (width, height), bits=photo_bits(scene, view))
     except WrongSize as error:
-        size = f"{error.width} x {error.height}"
-        turned = " (as it is stored; EXIF turns it for display)" if is_turned(path) else ""
-        message = f"{path}: the image of view {view} is {size}{turned}, its camera says {width} x {height}"
-        raise InputError(message) from None
+        raise InputError(f"{path}: the image of view {view} is {error}") from None
     except InputError as error:
         message = f"{path}: the image of view {view} cannot be read, expected a whole image file: {error}"
         raise InputError(message) from error
-    return pixels

@@ -35,35 +35,13 @@ def decode_crop(counts: str | list[int], width: int, height: int) -> Crop:
     """The tight crop of the mask that `decode_rle` gives, without the rest of the image; of a mask without pixels one
     that is not set, (0, 0, 1, 1). Raises InputError if the counts do not add up to the image."""
     runs = _read_runs(counts, width, height)
-    ends = runs.cumsum()
-    stops = ends[1::2]
-    starts = ends[::2][: len(stops)]
-    starts, stops = starts[stops > starts], stops[stops > starts]
-    if not len(stops):
-        return Crop((0, 0, 1, 1), torch.zeros(1, 1, dtype=torch.bool))
-    left, right = int(starts[0]) // height, (int(stops[-1]) - 1) // height + 1
-    # a run that goes on in the next column holds the bottom of the one and the top of the other
-    is_whole = bool((starts // height < (stops - 1) // height).any())
-    top, bottom = (0, height) if is_whole else (int((starts % height).min()), int(((stops - 1) % height).max()) + 1)
+    ends, is_mask = runs.cumsum(), np.arange(len(runs)) % 2 == 1
+    some = is_mask & (runs > 0)
+    columns = np.append((ends - runs)[some], ends[some] - 1) // height
+    left, right = (int(columns.min()), int(columns.max()) + 1) if len(columns) else (0, 1)
     borders = np.clip(ends, left * height, right * height) - left * height
-    strip = np.repeat(np.arange(len(runs)) % 2 == 1, np.diff(borders, prepend=0))
-    pixels = strip.reshape(right - left, height)[:, top:bottom].T
-    return Crop((left, top, right, bottom), torch.from_numpy(pixels.copy()))
-
-
-def shared_neighbours(runs: NDArray[np.int64], width: int, height: int) -> tuple[float, float]:
-    """How many pixels of a mask have its next pixel beside them in the next column, by runs down the columns, and by
-    runs along the rows. Of a mask that hangs together, the right one is nearly all."""
-    ends = runs.cumsum()
-    stops = ends[1::2]
-    starts = ends[::2][: len(stops)]
-    places = np.append(0, np.stack([starts, stops], 1).ravel())
-    counts = np.append(0, np.stack([0 * starts, stops - starts], 1).ravel().cumsum())
-
-    def shared(step: int) -> float:
-        return float((np.interp(stops + step, places, counts) - np.interp(starts + step, places, counts)).sum())
-
-    return shared(height), shared(width)
+    strip = np.repeat(is_mask, np.diff(borders, prepend=0)).reshape(right - left, height)
+    return Crop((left, 0, right, height), torch.from_numpy(strip.T)).tighten()
 
 
 def _read_runs(counts: str | list[int], width: int, height: int) -> NDArray[np.int64]:
@@ -96,3 +74,18 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     """(H, W) bool -> COCO compressed RLE that json can write."""
     rle = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
+
+
+def shared_neighbours(runs: NDArray[np.int64], width: int, height: int) -> tuple[float, float]:
+    """How many pixels of a mask have its next pixel beside them in the next column, by runs down the columns, and by
+    runs along the rows. Of a mask that hangs together, the right one is nearly all."""
+    ends = runs.cumsum()
+    stops = ends[1::2]
+    starts = ends[::2][: len(stops)]
+    places = np.append(0, np.stack([starts, stops], 1).ravel())
+    counts = np.append(0, np.stack([0 * starts, stops - starts], 1).ravel().cumsum())
+
+    def shared(step: int) -> float:
+        return float((np.interp(stops + step, places, counts) - np.interp(starts + step, places, counts)).sum())
+
+    return shared(height), shared(width)

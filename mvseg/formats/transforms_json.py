@@ -25,14 +25,16 @@ from mvseg.scene import ROTATION_TOLERANCE, Scene
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 Row4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 Rows = tuple[Row4, Row4, Row4] | tuple[Row4, Row4, Row4, Row4]
-OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "is_latlong", "is_equirectangular")  # of instant-ngp
-# Keys that move pixels or cameras, and are not read: they must be 0.
-MOVING = ("k5", "k6", "s1", "s2", "s3", "s4", "xi", "skew", "rolling_shutter", "x_fov", "y_fov")
+# Keys of other lenses, or that move pixels or cameras, and are not read: they must be 0.
+MOVING = (
+    "k5", "k6", "s1", "s2", "s3", "s4", "xi", "skew", "rolling_shutter", "x_fov", "y_fov", "ftheta_p0", "latlong",
+    "equirectangular", "is_latlong", "is_equirectangular",
+)  # fmt: skip
 # Keys that say nothing about cameras.
 ASIDE = {
     "aabb_scale", "scale", "offset", "up", "from_na", "sharpness", "rotation", "colmap_im_id", "depth_file_path",
     "ply_file_path", "orientation_override", "train_filenames", "val_filenames", "test_filenames", "time", "fps",
-    "n_frames", "integer_depth_scale", "white_transparent", "black_transparent", *MOVING, *OTHER_LENSES,
+    "n_frames", "integer_depth_scale", "white_transparent", "black_transparent", *MOVING,
 }  # fmt: skip
 LENS = ("k1", "k2", "k3", "k4", "p1", "p2")  # order of nerfstudio's distortion_params
 Angle = Annotated[float, Field(gt=0, lt=math.pi)]
@@ -111,9 +113,6 @@ def _check_keys(path: Path, transforms: _Transforms) -> None:
     unknown: dict[str, str] = {}
     for owner, entry in (("the file", transforms), *((each.file_path, each) for each in transforms.frames)):
         extra = entry.model_extra or {}
-        for key in OTHER_LENSES:
-            if extra.get(key):
-                raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
         for key in MOVING:
             if np.any(extra.get(key) or 0):
                 raise InputError(f"{path}: '{key}' of {owner} is {extra[key]}, which is not supported, expected 0")

@@ -16,7 +16,7 @@ from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import NO_LINKS, Links
-from mvseg.matching.numbers import DOUBTS, NVIEW
+from mvseg.matching.numbers import NVIEW
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.partition import Clusters
@@ -189,11 +189,11 @@ def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detec
         return None
     share = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
     is_capped, odd = report.residual_px == NVIEW.dilations[-1], odd_views(report.view_explained)
-    if share >= DOUBTS.trusted and not is_capped and not odd:
+    if share >= NVIEW.trusted and not is_capped and not odd:
         return None
     called = tuple(names) or tuple(f"view {view}" for view in range(regions.num_views))
     odd_ones = list_some([called[view] for view in odd])
-    if is_detected and share < DOUBTS.trusted:
+    if is_detected and share < NVIEW.trusted:
         return Finding("detector_unsure", values={"share": share})
     if is_detected and odd:
         return Finding("views_odd_detected", odd_ones, views=tuple(odd))
@@ -206,9 +206,9 @@ def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detec
         counts = {"count": int(num_per_view[few[0]]), "usual": int(num_per_view.median()), "share": share}
         return Finding("view_sparse", called[few[0]], counts, (few[0],))
     others = is_matched & ~torch.isin(regions.view_index, torch.tensor(odd).to(regions.view_index))
-    if odd and others.any() and float(matching.match_scores[others].mean()) >= DOUBTS.trusted:  # they agree
+    if odd and others.any() and float(matching.match_scores[others].mean()) >= NVIEW.trusted:  # they agree
         return Finding("views_odd", odd_ones, {"share": share}, tuple(odd))
-    if share >= DOUBTS.trusted:
+    if share >= NVIEW.trusted:
         return Finding("rough_masks", values={"px": NVIEW.dilations[-1]})
     return Finding("views_disagree", values={"share": share})
 
@@ -216,6 +216,6 @@ def find_disagreement(matching: Matching, names: Sequence[str] = (), *, is_detec
 def odd_views(view_explained: Tensor) -> list[int]:
     """The views that explain far less than the median of the others does: most likely their poses are wrong.
     `view_explained` (V,) is that of `Matching`; none with fewer than four views, or where no view explains anything."""
-    if len(view_explained) < DOUBTS.min_views:
+    if len(view_explained) < NVIEW.min_views:
         return []
-    return (view_explained < DOUBTS.alike * view_explained.nanmedian()).nonzero()[:, 0].tolist()
+    return (view_explained < NVIEW.alike * view_explained.nanmedian()).nonzero()[:, 0].tolist()

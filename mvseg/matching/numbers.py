@@ -1,6 +1,6 @@
 """The numbers of matching: definitions, technical limits, and what was fitted to development plants.
 
-Sentences say what a third less, and a third more, changes (`python benchmarks/thirds.py --cache DIR`): pair F1 of
+Sentences say what a third less, and a third more, changes (`python -m benchmarks.thirds --cache DIR`): pair F1 of
 "nview" on degraded masks of 32 leaves in 5 views, unless they say otherwise. Weights of regressions stand beside the
 features that they weigh.
 """
@@ -132,7 +132,7 @@ class ClusterSearchNumbers:
 
 @dataclass(frozen=True)
 class NViewNumbers:
-    """Reprojection errors that are tried, and when there is no telling."""
+    """Reprojection errors that are tried, when there is no telling, and when the user is warned."""
 
     dilations: tuple[int, ...] = (1, 2, 4, 8)  # definition: the reprojection errors that are tried, pixels
     as_good: float = 0.05  # chosen: score below the best one at which a smaller error is as good
@@ -142,16 +142,8 @@ class NViewNumbers:
     # Poses are far off, or leaves move between photos, where it is less: 0.02 to 0.21 for three plants that sway, seen
     # from near, 0.34 for the true masks of one; 0.39 or more for 12 other plants, and 0.42 for all evaluation scenes.
     unexplained: float = 0.3  # chosen: mean score of clusters by weights below which these are the answer
-
-
-@dataclass(frozen=True)
-class DisagreementNumbers:
-    """When a matching is warned of; no id depends on it.
-
-    Of 80 development scenes with exact poses and right ids one is warned of: its detector finds a third of the leaves
-    (`benchmarks/confidence.py`).
-    """
-
+    # When a matching is warned of; no id depends on it. Of 80 development scenes with exact poses and right ids one is
+    # warned of: its detector finds a third of the leaves (`benchmarks/confidence.py`).
     trusted: float = 0.75  # chosen: mean match score from which ids are taken for right
     alike: float = 0.7  # chosen: max. explained share of an odd view, relative to the median view
     min_views: int = 4  # limit: views from which one of them can be told to be odd
@@ -167,4 +159,3 @@ GAINS = GainNumbers()
 PIECES = PieceNumbers()
 SEARCH = ClusterSearchNumbers()
 NVIEW = NViewNumbers()
-DOUBTS = DisagreementNumbers()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -66,21 +67,17 @@ def view_samples(regions: Regions) -> tuple[list[Samples], list[Tensor]]:
     return samples, members
 
 
-def view_runs(regions: Regions, max_per_region: int | None = None) -> tuple[list[Samples], list[Tensor]]:
+def view_runs(regions: Regions, max_per_region: float = math.inf) -> tuple[list[Samples], list[Tensor]]:
     """The pixels of the regions as runs of at most `EPIPOLAR.run_px` along the rows, view by view; see `view_samples`.
     Of masks of more than `max_per_region` pixels, the runs of points of a lattice (see `Regions.thin`)."""
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
     samples = []
     for nodes in members:
-        chosen, areas = regions.select(nodes), regions.areas[nodes]
-        if max_per_region is None:
-            xy, length, owner = chosen.runs(EPIPOLAR.run_px)
-            pitch, weight = torch.ones_like(length), length.float()
-        else:
-            chosen, origin, steps = chosen.thin(max_per_region)
-            lattice_xy, length, owner = chosen.runs(EPIPOLAR.run_px)
-            pitch, weight = steps[owner], length * (areas / chosen.areas.clamp(min=1)).float()[owner]
-            xy = ((lattice_xy - 0.5) * pitch[:, None] + origin[owner]).T.contiguous().T
+        areas = regions.areas[nodes]
+        chosen, origin, steps = regions.select(nodes).thin(max_per_region)
+        lattice_xy, length, owner = chosen.runs(EPIPOLAR.run_px)
+        pitch, weight = steps[owner], length * (areas / chosen.areas.clamp(min=1)).float()[owner]
+        xy = ((lattice_xy - 0.5) * pitch[:, None] + origin[owner]).T.contiguous().T
         last = torch.stack((xy[:, 0] + (length - 1) * pitch, xy[:, 1])).T
         samples.append(Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes), last_xy=last, length=length))
     return samples, members

@@ -19,7 +19,7 @@ from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.open_scene import Opened
 from mvseg.pipeline.plant import Plant
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import ORIENTED, Approach
 from mvseg.regions import Regions
 from mvseg.results.result import Instances
@@ -32,7 +32,7 @@ FIELDS = (
 )  # fmt: skip
 # All that may be in the file: data without any code of its own, as a result may come from anybody.
 CLASSES: list[Any] = [
-    Approach, Finding, Instances, LeafSurface, RejectedCandidate, MatchReport, Masks, Matching, Quality, Regions
+    Approach, Finding, Instances, LeafSurface, RejectedCandidate, MatchReport, Masks, Matching, Regions
 ]  # fmt: skip
 
 

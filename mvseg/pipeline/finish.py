@@ -118,7 +118,7 @@ def _stems_of(result: Result, config: RunConfig) -> list[int]:
 
 def _find_doubtful(surfaces: Mapping[int, LeafSurface], stems: Sequence[int]) -> Finding | None:
     surfaces = {leaf: each for leaf, each in surfaces.items() if leaf not in stems}
-    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if not each.quality.is_good)
+    leaves = tuple(str(leaf) for leaf, each in sorted(surfaces.items()) if each.reasons)
     if not leaves:
         return None
     values: Values = {"count": len(leaves), "total": len(surfaces), "leaves": leaves}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from threading import Event, Thread
 from typing import Any, TypeVar
 
 import pycolmap
@@ -16,31 +16,16 @@ def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> 
     """Run a function of pycolmap; it gets a `cancellation_token` and returns soon after that was cancelled. Python
     handles signals between bytecodes only, and such a call takes seconds to minutes. Raises what the call raises; or
     what a signal raises meanwhile, once the call has returned."""
-    token, done, answers, errors = pycolmap.CancellationToken(), Event(), [], []
-
-    def run() -> None:
+    token = pycolmap.CancellationToken()
+    with quiet_colmap(), ThreadPoolExecutor(1) as thread:  # which waits for the end of the call
+        thread.submit(int).result()  # while a thread starts, a signal would make the executor forget it
         try:
-            if not token.is_cancelled:
-                answers.append(call(*args, cancellation_token=token, **options))
-        except BaseException as error:
-            errors.append(error)
-        finally:
-            done.set()
-
-    thread = Thread(target=run)
-    with quiet_colmap():
-        try:
-            thread.start()
-            # seconds; not `join`: in Python 3.11 an exception in it takes the thread for ended
-            while not done.wait(0.1):
+            future = thread.submit(call, *args, cancellation_token=token, **options)
+            while not wait([future], 0.1).done:  # seconds
                 pass
         finally:  # files that the call still writes are about to be deleted
             token.cancel()
-            if thread.ident is not None:
-                done.wait()
-    if errors:
-        raise errors[0]
-    return answers[0]
+    return future.result()
 
 
 @contextmanager

@@ -37,9 +37,6 @@ class Sift:
     angle: Floats
     descriptors: NDArray[np.uint8]
 
-    def __len__(self) -> int:
-        return len(self.px)
-
 
 def find_sift(photo: Photo, *, image_size: int, most: int) -> Sift:
     """The features of most contrast of a photo (H, W, 3) uint8 RGB, at most `most`; a photo whose longer side has more

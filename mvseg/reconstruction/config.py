@@ -40,9 +40,8 @@ class ReconstructConfig:
     def __post_init__(self) -> None:
         check_choices(self, "reconstruct")
         check_ranges(self, "reconstruct", voxel_budget=(1, math.inf))
-        if not 0 <= self.threshold < 1:
-            raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
-        if not 0 <= self.seen_share < 1:
-            raise InputError(f"reconstruct.seen_share is {self.seen_share:g}, expected a number in [0, 1)")
+        for name, share in (("threshold", self.threshold), ("seen_share", self.seen_share)):
+            if not 0 <= share < 1:
+                raise InputError(f"reconstruct.{name} is {share:g}, expected a number in [0, 1)")
         if self.voxel_size is not None and not 0 < self.voxel_size < float("inf"):
             raise InputError(f"reconstruct.voxel_size is {self.voxel_size:g}, expected a positive number")

@@ -1,6 +1,6 @@
 """The numbers of reconstruction: definitions, technical limits, and what was fitted to development plants.
 
-`python benchmarks/thirds.py --cache DIR --room reconstruction` prints what a third less or more of each changes; the
+`python -m benchmarks.thirds --cache DIR --room reconstruction` prints what a third less or more of each changes; the
 table is in docs/notes/surfaces.md. A share is relative to the noun in its sentence; "masks" are those of one leaf.
 """
 
@@ -99,7 +99,7 @@ class PriorNumbers:
 class FitNumbers:
     """A patch moves until its outlines are those of the masks; pairs are of the first steps and of the last.
 
-    Covariances were fitted (`python benchmarks/traits.py --cache DIR`, column "inside").
+    Covariances were fitted (`python -m benchmarks.traits --cache DIR`, column "inside").
     """
 
     grid: tuple[int, int] = (36, 9)  # limit: rows and columns of points at which a patch is fitted and measured
@@ -205,7 +205,7 @@ class OccupancyNumbers:
     # Simulated simple leaves have 0.88 and more with exact masks; with faulty ones, occupancy explains them no better.
     explained: float = 0.87  # chosen: median IoU of a patch from which it is the leaf as it is
     least_gain: float = 0.01  # chosen: IoU by which occupancy must explain the masks better than the patch
-    sheet_share: float = 0.7  # fitted: python benchmarks/traits.py --areas PALM; of the patch's deviation of the area
+    sheet_share: float = 0.7  # fitted: python -m benchmarks.traits --areas PALM; of the patch's deviation of the area
     edge_px: float = 0.5  # definition: masks may hold, or lack, the pixels that outlines cross
 
 
@@ -250,7 +250,7 @@ class AxisNumbers:
     least_petiole: float = 0.01  # limit: length of a petiole below which the axis may not go on along its ray
     to_bases: float = 0.05  # chosen: weight of the distance of the axis along a ray, where that beside it is 1
     petiole_square: float = 0.1  # chosen: weight of squared lengths of petioles against distances of their rays
-    arch_deg: float = 7.0  # fitted: python benchmarks/stems.py (of a petiole's chord to its end at the blade)
+    arch_deg: float = 7.0  # fitted: python -m benchmarks.stems (of a petiole's chord to its end at the blade)
     near: float = 0.12  # chosen: distance of a ray from the axis that has half the weight of none
     near_share: float = 0.6  # chosen: min. share of the leaves that are nearer than this
     least_extent: float = 2.5  # chosen: min. distance between the outer nodes, in median petioles or misses

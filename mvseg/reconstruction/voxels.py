@@ -169,8 +169,7 @@ def back_project(
         asked = int((last - first).prod())
         raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {VOXELS.max_voxels}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
-    full = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
-    frames = None if full is None else Silhouettes(tuple(full), matrices)
+    frames = None if free is None else Silhouettes(tuple(free[view].to(members.device) for view in views), matrices)
     votes = _share_of_masks(silhouettes, axes, free=frames, seen_share=config.seen_share)
     return VoxelGrid(
         origin=first * size, voxel_size=size, votes=votes, num_views=len(views), threshold=config.threshold

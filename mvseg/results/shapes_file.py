@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mvseg.errors import InputError
 from mvseg.reconstruction.numbers import OCCUPANCY
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS
-from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Occupancy, Quality
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Occupancy
 from mvseg.reconstruction.voxels import VoxelGrid
 
 SURFACES_FILE, VOXELS_FILE = "surfaces.npz", "voxels.npz"
@@ -36,7 +36,7 @@ def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
     """
     leaves = sorted(surfaces)
     own = [surfaces[leaf] for leaf in leaves]
-    reasons = [each.quality.reasons for each in own]
+    reasons = [each.reasons for each in own]
     occupied = {place: each.occupancy for place, each in enumerate(own) if each.occupancy is not None}
     np.savez_compressed(
         path,
@@ -72,9 +72,9 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         surfaces = {}
         for leaf, is_oriented, doubts, codes, *own in zip(*rows, strict=True):
             tensors: dict[str, Any] = dict(zip(TENSORS, (torch.from_numpy(each.copy()) for each in own), strict=True))
-            quality = Quality(dict(zip(codes.tolist(), doubts.tolist(), strict=True)))
-            surface = LeafSurface(**tensors, is_oriented=bool(is_oriented), quality=quality)
-            if not surface.exists and (surface.coefficients.isfinite().any() or not surface.quality.reasons):
+            why = dict(zip(codes.tolist(), doubts.tolist(), strict=True))
+            surface = LeafSurface(**tensors, is_oriented=bool(is_oriented), reasons=why)
+            if not surface.exists and (surface.coefficients.isfinite().any() or not surface.reasons):
                 raise ValueError(f"leaf {leaf} has coefficients that are not finite")
             surfaces[int(leaf)] = surface
         occupied = (arrays.get(name, ()) for name in ("occupied", "shares", "area"))  # an older version has none

@@ -23,7 +23,7 @@ from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
-from mvseg.formats.markers import find_markers, read_grey
+from mvseg.formats.markers import find_scene_markers
 from mvseg.formats.photos import Photos, require_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import BAR, FAMILY, Shape, list_shapes, tag_corners
@@ -161,12 +161,8 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
 
 def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
     """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
-    sightings: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
-    scene, on_page = photos.scene, tag_corners()
-    for view in progress_bar(range(len(scene.views)), name="tags", unit="photo"):
-        for number, quad in find_markers(read_grey(photos, view), FAMILY).items():
-            for corner in range(4 if number in on_page else 0):
-                sightings.setdefault((number, corner), []).append((view, quad[corner]))
+    scene, on_page, seen = photos.scene, tag_corners(), find_scene_markers(photos, (FAMILY,))[FAMILY]
+    sightings = {corner: places for corner, places in seen.items() if corner[0] in on_page}
     corners = triangulate_points(scene.cameras, sightings)
     if not corners:
         found = "no tag of the page is found in the photos"

@@ -25,7 +25,7 @@ from mvseg.poses.mapping import IMAGES, Structure, find_structure, move_structur
 from mvseg.poses.numbers import STRUCTURE
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.video import check_motion, choose_frames, fill_gaps, frame_name, is_video, watch, write_frames
-from mvseg.results.earlier import Output, check_out, replace_result
+from mvseg.results.earlier import Output, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
 from mvseg.system.running import now_running, report_step
@@ -59,7 +59,7 @@ def pose_photos(
         raise InputError(f"unit is {world.unit}, and no length is known: expected --marker, --distance, ... with it")
     is_clip, file = is_video(photos), config.calibration
     output = Output("scene", of=(photos,), reads=tuple(path for path in (file, world.positions) if path is not None))
-    check_place(out, output)
+    sweep_abandoned(out)
     source, names = (photos, []) if is_clip else list_folder(photos, out)
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if world.positions is not None:
@@ -125,13 +125,6 @@ def list_folder(photos: Path, out: Path) -> tuple[Path, list[str]]:
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
     return source, names
-
-
-def check_place(out: Path, output: Output) -> None:
-    """Check that a scene may be written to `out`, after taking away leftovers of a killed run beside it. Raises
-    InputError: `out` holds something other than an earlier scene of these photos."""
-    sweep_abandoned(out)
-    check_out(out, output)
 
 
 def _find_structure_of_clip(

@@ -25,8 +25,9 @@ from mvseg.poses.mapping import IMAGES
 from mvseg.poses.photo_files import PhotoFile, calibrated_size, copy_photos
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import Output, replace_result
-from mvseg.runs.pose_photos import check_place, list_folder, write_walk
+from mvseg.runs.pose_photos import list_folder, write_walk
 from mvseg.scene import Scene
+from mvseg.system.atomic import sweep_abandoned
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.say import say
 
@@ -53,7 +54,7 @@ def pose_board_photos(
     cannot hold, a photo is broken, or `out` holds something else.
     """
     output = Output("scene", of=(photos,))
-    check_place(out, output)
+    sweep_abandoned(out)
     source, names = list_folder(photos, out)
     given = None if calibration is None else read_calibration(calibration.parent, calibration.name)
     run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
@@ -110,7 +111,7 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
     """
     reads = (turntable, angles) if isinstance(angles, Path) else (turntable,)
     output = Output("scene", of=(photos,), reads=reads)
-    check_place(out, output)
+    sweep_abandoned(out)
     source, names = list_folder(photos, out)
     cameras, known, unit = read_turntable_parts(turntable)
     camera_of = _camera_of(names, list(cameras), turntable)

@@ -15,7 +15,7 @@ from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
@@ -45,13 +45,9 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        corrector, is_number = self.server.corrector, re.compile("[0-9]{1,15}").fullmatch
-
-        def state() -> dict[str, Any]:
-            asked = self._asked("after")
-            return corrector.state(int(asked) if is_number(asked) else -1)
-
-        self._answer({"": corrector.page, "state": state})
+        corrector, after = self.server.corrector, self._asked("after")
+        number = int(after) if re.fullmatch("[0-9]{1,15}", after) else -1
+        self._answer({"": corrector.page, "state": partial(corrector.state, number)})
 
     def do_PUT(self) -> None:
         self._answer({"edits": lambda: self.server.corrector.save(self._body(), self._asked("base"))})
@@ -86,22 +82,18 @@ class _Handler(BaseHTTPRequestHandler):
             self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _place(self) -> str:
-        """The path below the token. Raises Refused: another name, origin or token, or no address at all."""
+        """The path below the token. Raises Refused: another name, origin or token."""
         own = f"{HOST}:{self.server.server_port}"
         origin = self.headers.get("Origin")
         if self.headers.get("Host") != own or (origin is not None and origin != f"http://{own}"):
             raise Refused(HTTPStatus.FORBIDDEN, "This address is only for the page that mvseg correct opens.")
-        try:
-            path = urlsplit(self.path).path
-        except ValueError:  # http://[
-            raise Refused(HTTPStatus.BAD_REQUEST, "The address cannot be read.") from None
-        token, _, place = path.lstrip("/").partition("/")
+        token, _, place = self.path.partition("?")[0].lstrip("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(HTTPStatus.FORBIDDEN, "The token is missing or old: open what mvseg correct prints.")
         return place
 
     def _asked(self, name: str) -> str:
-        return parse_qs(urlsplit(self.path).query).get(name, [""])[0]
+        return parse_qs(self.path.partition("?")[2]).get(name, [""])[0]
 
     def _body(self) -> bytes:
         length = self.headers.get("Content-Length", "")

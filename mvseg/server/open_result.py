@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -267,16 +267,10 @@ def keep_numbers(result: Result, number_of: dict[str, int], previous: Masks | No
     return replace(result, matching=result.matching.with_masks(kept), instances=result.instances.renumber(numbers))
 
 
-@contextmanager
-def open_alone(folder: Path) -> Iterator[None]:
+def open_alone(folder: Path) -> AbstractContextManager[None]:
     """Keep a second process from correcting the same result; the lock ends with this process, however it ends. Raises
     InputError: another one has it open."""
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(lock_folder(folder))
-        except InputError:
-            raise InputError(f"{folder}: another mvseg correct has this result open, expected one at a time") from None
-        yield
+    return lock_folder(folder, other="another mvseg correct has this result open")
 
 
 def check_writable(folder: Path) -> None:

@@ -71,26 +71,17 @@ class SavedEdits:
             raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
         if self.is_changed():
             raise Refused(HTTPStatus.CONFLICT, CHANGED)
-        before, self.corrections = self.corrections, mark(corrections)
-        try:
-            self.write()
-        except OSError:
-            self.corrections = before
-            raise
+        self.write(mark(corrections))
 
     def is_changed(self) -> bool:
         """Whether another program has written other edits to the file. (One that was deleted is written again.)"""
         stamp = self._find_stamp()
         if stamp in (None, self._stamp):
             return False
-        try:
-            found = read_saved(self.path.parent)
-        except InputError:
-            return True
-        if name_edits(found.edits) != self.name:
-            return True
-        self._stamp = stamp
-        return False
+        with suppress(InputError):  # broken, and so changed
+            if name_edits(read_saved(self.path.parent).edits) == self.name:
+                self._stamp = stamp
+        return self._stamp != stamp
 
     def take_changes(self, read: Read) -> bool:
         """Go on from the file if another program has written to it; False where it has written nothing. Raises
@@ -102,9 +93,9 @@ class SavedEdits:
         self._stamp = stamp
         return True
 
-    def write(self) -> None:
-        write_corrections(self.path, self.corrections)
-        self._stamp = self._find_stamp()
+    def write(self, corrections: Corrections) -> None:
+        write_corrections(self.path, corrections)
+        self.corrections, self._stamp = corrections, self._find_stamp()
         self._own.add(self.name)
 
     def begin(self) -> None:
@@ -112,14 +103,14 @@ class SavedEdits:
         if self.is_changed():
             raise InputError(CHANGED)
         self._own.clear()
-        self.write()
+        self.write(self.corrections)
 
     def write_again(self) -> None:
         """Write the newest edits after the folder was made anew, where the file holds earlier ones of this page,
         whoever put them back; but never over those of another program."""
         with suppress(InputError):  # theirs, and broken: `is_changed` says so
             if name_edits(read_saved(self.path.parent).edits) in self._own:
-                self.write()
+                self.write(self.corrections)
 
     def _find_stamp(self) -> tuple[int, int] | None:
         with suppress(OSError):

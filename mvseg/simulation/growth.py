@@ -43,7 +43,6 @@ class SimulatedPlant:
     stems: tuple[Floats, ...] = ()
     petioles: tuple[Floats, ...] = ()
     is_wild: bool = False
-    unit: str = "mm"
 
 
 @dataclass(frozen=True, eq=False)

@@ -55,7 +55,7 @@ def write_views(folder: Path, plant: SimulatedPlant, cameras: Cameras, *, seed: 
         write_jpeg(each.path, shot.rgb)
         write_label_png(folder / "truth" / f"{each.name}.png", truth)
         write_label_png(folder / "masks" / f"{each.name}.png", shuffle_labels(truth, shuffle))
-    scene = Scene(name=folder.name, views=views, cameras=cameras, unit=plant.unit, up=(0.0, 0.0, 1.0))
+    scene = Scene(name=folder.name, views=views, cameras=cameras, unit="mm", up=(0.0, 0.0, 1.0))
     write_rig(folder / "cameras.json", scene, [f"images/{each.path.name}" for each in views])
 
 

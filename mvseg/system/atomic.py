@@ -15,7 +15,7 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile, mkstemp
 from typing import Any
@@ -26,6 +26,7 @@ from mvseg.errors import InputError
 
 PARTIAL, ASIDE, READY, LOCK = ".partial", ".mvseg-aside", ".mvseg-ready", ".lock"
 LEFT = (PARTIAL, ASIDE, READY, LOCK)  # what killed runs leave
+OTHER_RUN = "another run is writing to this folder"
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # errors of disks without locks
 
 
@@ -105,16 +106,14 @@ def sweep_folder(folder: Path) -> None:
         sweep_abandoned(folder / name)
 
 
-@contextmanager
-def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
+def lock_folder(folder: Path, *, wait: bool = False, other: str = OTHER_RUN) -> AbstractContextManager[None]:
     """Keep other runs out of a folder in which files are added one by one; the lock ends with the process. Raises
-    InputError if another process works in it, and `wait` is not set."""
-    with _locked(folder / LOCK, wait=wait):
-        yield
+    InputError if another process works in it, and `wait` is not set; `other` says what that does."""
+    return _locked(folder / LOCK, wait=wait, other=other)
 
 
 @contextmanager
-def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
+def _locked(path: Path, *, wait: bool = False, other: str = OTHER_RUN) -> Iterator[None]:
     """Lock a file that exists only while a process holds the lock, or after its holder was killed."""
     if not path.parent.is_dir():  # filelock would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
@@ -124,8 +123,7 @@ def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout:
-        message = f"{path.parent}: another run is writing to this folder, expected one at a time"
-        raise InputError(message) from None
+        raise InputError(f"{path.parent}: {other}, expected one at a time") from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise

@@ -21,7 +21,7 @@ from mvseg.tracking.fitted_costs import POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
 from mvseg.tracking.numbers import ALIGN
 
-GUESS = (-2.02, 0.99, 2.05)  # fitted: python benchmarks/fit_chances.py; offset, own and strange gain
+GUESS = (-2.02, 0.99, 2.05)  # fitted: python -m benchmarks.fit_chances; offset, own and strange gain
 
 
 @dataclass(frozen=True, eq=False)

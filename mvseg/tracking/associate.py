@@ -20,7 +20,7 @@ from mvseg.errors import InputError
 from mvseg.tracking.compare import Asked, Comparison, Observation, link_chances
 from mvseg.tracking.numbers import LINKING
 
-# fitted: slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
+# fitted: slope and offset of the log odds of links; `python -m benchmarks.fit_chances` fits them
 CALIBRATION = (0.33, 4.08)
 
 

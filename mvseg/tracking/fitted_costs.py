@@ -49,7 +49,7 @@ class Scales:
     parting: float
 
 
-# fitted: python benchmarks/fit_costs.py, on seedlings, a maize, a basil and simulated plants in true poses; `cloud` and
+# fitted: python -m benchmarks.fit_costs, on seedlings, a maize, a basil and simulated plants in true poses; `cloud` and
 # `near` with --places-too. `grown` of links, fitted to 0.17, was chosen; why other scales stay as an earlier fit had
 # them stands in docs/notes/tracking.md. Poses are found by bases and directions: surfaces lie on each other in exact
 # poses only.

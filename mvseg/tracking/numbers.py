@@ -1,6 +1,6 @@
 """The numbers of tracking: definitions, technical limits, and what was fitted to simulated and real series.
 
-`python benchmarks/thirds.py --room tracking` prints what a third less or more of each changes; the table is in
+`python -m benchmarks.thirds --room tracking` prints what a third less or more of each changes; the table is in
 docs/notes/tracking.md. Scales and weights that were fitted together stand in `fitted_costs.py`, `align.py` and
 `associate.py`.
 """
@@ -34,7 +34,7 @@ class AlignNumbers:
     tip: float = 0.43  # chosen: weight of the tip of a leaf there, where base and middle have 1, for tips sway
     least_weight: float = 1.0  # chosen: min. weight there of a pair that the user says is one leaf
     large_new: float = 3.0  # chosen: log odds that each large leaf costs a pose that lets it appear from nowhere
-    temper: float = 0.44  # fitted: python benchmarks/fit_chances.py; share of a gain of a pose that is log odds
+    temper: float = 0.44  # fitted: python -m benchmarks.fit_chances; share of a gain of a pose that is log odds
     told: float = 0.9  # chosen: probability of an alignment below which the user is told
     turns: int = 30  # definition: turns of a pot that leaves can tell apart, of 12 degrees
     rounds: int = 5  # limit: max. rounds of pairing leaves and fitting a pose to them

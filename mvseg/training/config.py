@@ -5,6 +5,7 @@ Imports nothing heavy, so that the command line can show its help quickly.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -174,11 +175,8 @@ class TrainConfig:
 
 def config_values(config: TrainConfig) -> dict[str, Any]:
     """The config as plain values, as YAML and checkpoints hold it: paths as strings, tuples as lists."""
-
-    def plain(value: Any) -> Any:
-        return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
-
-    return {name: plain(value) for name, value in asdict(config).items()}
+    values: dict[str, Any] = json.loads(json.dumps(asdict(config), default=str))
+    return values
 
 
 def config_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:

@@ -215,12 +215,8 @@ def read_sample(sample: Sample) -> LabelledPhoto:
 def _read(sample: Sample) -> tuple[LabelledPhoto, int]:
     """And how many entries of its masks are boxes, lines and points, which are left out."""
     with faults_of(sample.name):
-        if not sample.photo.is_file():
-            raise InputError(f"the photo {sample.photo} is missing")
-        try:
+        with faults_of(f"the photo {sample.photo} cannot be read, expected a whole image file"):
             photo = read_rgb(sample.photo)
-        except InputError as error:
-            raise InputError(f"the photo cannot be read, expected a whole image file: {error}") from None
         if not sample.kind:
             return _read_annotations(sample, photo)
         try:
@@ -257,8 +253,6 @@ def _read_annotations(sample: Sample, photo: np.ndarray) -> tuple[LabelledPhoto,
                 classes.append(sample.class_of[category])
             else:
                 raise InputError(f"its category {category} is not listed")
-    for mask in masks:
-        ignore &= ~mask  # a labelled instance is known, whatever covers part of it
     return mask_photo(photo, masks, classes=classes, ignore=ignore), num_empty
 
 

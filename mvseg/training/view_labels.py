@@ -66,8 +66,6 @@ class ViewLabels:
         rows = (self.leaves.view_index == view).nonzero()[:, 0].tolist()
         shown = [_scale(self.leaves.regions.placed(row).within(box).pixels, size) for row in rows]
         masks = [mask for mask in shown if mask.any()]
-        for mask in masks:
-            ignore &= ~mask
         return mask_photo(small, masks, classes=[1] * len(masks), ignore=ignore)
 
 

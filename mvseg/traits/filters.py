@@ -46,16 +46,12 @@ def find_rejected(
         ("low_quality", ious, config.min_quality, "median IoU {:.2f} with its masks, asked for is {:g}"),
         ("few_sure_views", sure_views, config.min_sure_views, "{} sure views, asked for are {}"),
     )
-    rejections: dict[int, Rejection] = {}
+    slender = "looks like a stem: it is slender for its plant, probability {:.2f}"
+    sure = {n: chance for n, chance in stems.items() if chance >= SURELY_STEM and config.leaves_only}
+    rejections = {instance: Rejection("stem", slender.format(chance)) for instance, chance in sure.items()}
     for kind, values, least, reason in limits:
         below = {instance: value for instance, value in values.items() if value < least}
         rejections |= {instance: Rejection(kind, reason.format(value, least)) for instance, value in below.items()}
-    if not config.leaves_only:
-        return rejections
-    for instance, chance in stems.items():
-        if chance >= SURELY_STEM and instance not in rejections:
-            reason = f"looks like a stem: it is slender for its plant, probability {chance:.2f}"
-            rejections[instance] = Rejection("stem", reason)
     return dict(sorted(rejections.items()))
 
 

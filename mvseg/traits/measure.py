@@ -31,10 +31,10 @@ from mvseg.traits.stems import StemMark, axes_of_masks, find_stems, judge_stems,
 from mvseg.traits.up import level_frame
 
 NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
-TILT_DEG = 10.0  # fitted: python benchmarks/stems.py --cache DIR --up; root mean square of lobed plants
+TILT_DEG = 10.0  # fitted: python -m benchmarks.stems --cache DIR --up; root mean square of lobed plants
 NO_NODE = missing("not measured: leaves and photos show no stem that it sits on")
 GOOD = "good"
-USELESS = {"poor_fit"}  # codes of reasons, by the errors of areas that `python benchmarks/traits.py` prints for each
+USELESS = {"poor_fit"}  # codes of reasons, by the errors of areas that `python -m benchmarks.traits` prints for each
 Use = Literal["yes", "look", "no"]
 UpFrom = Literal["scene", "stem", ""]
 NO_MASKS = LeafSurface.none(torch.zeros(0, dtype=torch.int64), "no_masks", "has no masks")
@@ -250,7 +250,7 @@ def describe_leaf(
     """The leaf with all of its traits, from the `numbers` that were measured; those that are missing with the reason.
     `shape` stands for it; `fitted` is its surface, credible or not, None where no surfaces were asked for; `rejection`
     says why it does not count as a leaf."""
-    reasons = {} if fitted is None else dict(fitted.quality.reasons)
+    reasons = {} if fitted is None else dict(fitted.reasons)
     if shape is None and fitted is None:
         reasons = {"no_shape": "has no shape: seen in one view, or its masks agree on no point"}
     if rejection is not None:

@@ -12,7 +12,7 @@ from mvseg.reconstruction.stem.stem_axis import StemAxis
 from mvseg.table import Table
 from mvseg.traits.leaf import VAGUE_DEG, Measurement, missing, wrap_azimuth
 
-ARCH_SD_DEG = 6.0  # fitted: python benchmarks/stems.py --cache DIR; of the angle by which petioles bend
+ARCH_SD_DEG = 6.0  # fitted: python -m benchmarks.stems --cache DIR; of the angle by which petioles bend
 BLADE_SD_DEG = 4.0  # fitted: the same; of the azimuth of a blade near its base against that of its petiole
 MISS_SHARE = 0.7  # fitted: the same; deviation of the axis at a node, in the median miss of the rays
 JITTER_DEG = 14.0  # fitted: the same; deviation of divergence angles of a plant from those of its phyllotaxis

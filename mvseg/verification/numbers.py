@@ -1,6 +1,6 @@
 """The numbers of verification: definitions, technical limits, and what was fitted to development plants.
 
-`python benchmarks/thirds.py --cache DIR --room verification` prints what a third less or more of each changes; the
+`python -m benchmarks.thirds --cache DIR --room verification` prints what a third less or more of each changes; the
 table is in docs/notes/detector.md. Weights of regressions stand beside the features that they weigh (`leaf_scores.py`).
 """
 

@@ -47,14 +47,8 @@ def test_a_process_that_dies_loses_its_own_item_only(light: None) -> None:
     assert [answers[key][0] for key in (1, 3, 5)] == ["A", "B", "C"]
     assert answers[0] == answers[2] == Lost("died, most likely because memory ran out")
     assert answers[4] == Lost("stopped with ValueError: it is broken")
-
-
-def test_the_last_item_may_kill_its_process(light: None) -> None:
     answers, _ = run(["a", "kill"], 1)
     assert (answers[0][0], type(answers[1])) == ("A", Lost)
-
-
-def test_nothing_to_do() -> None:
     assert run([], 2) == ({}, [])
 
 

@@ -46,14 +46,11 @@ def test_paths_of_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         list_scenes(write(tmp_path, "scene,name\nbasil,10:30\n"), OUT, None)
 
 
-def test_tables_with_semicolons_and_names(tmp_path: Path) -> None:
+def test_tables_with_semicolons_names_and_columns_in_any_case(tmp_path: Path) -> None:
     table = write(tmp_path, "scene;name;height\na;first;1,5\nb;;2,5\n")
     scenes = list_scenes(table, OUT, None)
     assert [scene.name for scene in scenes] == ["first", "b"]
     assert scenes[0].carried == {"plant": "first", "time": "", "height": "1,5"}
-
-
-def test_names_of_columns_in_any_case(tmp_path: Path) -> None:
     (scene,) = list_scenes(write(tmp_path, "Scene,Plant,Species,Genotype,\na,b,Fig,X,\n"), OUT, None)
     assert scene.carried == {"plant": "b", "time": "", "Species": "Fig", "Genotype": "X"}
 

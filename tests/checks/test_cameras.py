@@ -162,7 +162,7 @@ def test_a_field_of_view_that_no_lens_has(demo_scene: Scene) -> None:
     assert (found.code, found.views) == ("odd_field_of_view", (1,))
 
 
-def test_views_from_one_side_only(demo_scene: Scene) -> None:
+def test_views_from_one_side_only_or_too_far_apart(demo_scene: Scene) -> None:
     cameras = cameras_at(arc_positions(9, span=1.0)[[0, 2, 4, 6, 8, 0, 2, 4, 6]])
     found = findings_of(demo_scene, cameras)
     assert [(each.code, each.views) for each in found] == [
@@ -173,9 +173,6 @@ def test_views_from_one_side_only(demo_scene: Scene) -> None:
     (narrow,) = camera_findings(scene, find_coverage(scene.cameras))
     assert (narrow.code, narrow.level) == ("one_sided", "warning")
     assert narrow.values["degrees"] == pytest.approx(17, abs=2)
-
-
-def test_views_too_far_apart(demo_scene: Scene) -> None:
     scene = replace(demo_scene, views=demo_scene.views[:2], cameras=demo_scene.cameras[[0, 4]])
     (found,) = camera_findings(scene, find_coverage(scene.cameras))
     assert (found.code, found.level, found.views) == ("next_view_far", "warning", (0, 1))

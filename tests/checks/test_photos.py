@@ -120,10 +120,7 @@ def test_a_dark_photo_of_12_bits_is_dark_beside_its_neighbours(tmp_path: Path) -
     for view in range(4):
         write_image(photo(folder, view), (ramp / (12 if view == 2 else 1 + view)).astype(np.uint16))
     assert [(each.views, each.code) for each in findings_of(folder)] == [((2,), "dark_photo")]
-
-
-def test_without_photos_masks_will_do(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "plant", images=False)
+    folder = write_scene(tmp_path / "masks alone", images=False)
     assert [each.level for each in findings_of(folder, has_masks=True)] == ["note"]
     assert [each.level for each in findings_of(folder)] == ["error"]
     (folder / "images").mkdir()

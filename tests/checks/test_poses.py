@@ -50,7 +50,7 @@ def test_sound_poses_have_no_finding(demo_scene: Scene, demo_regions: Regions) -
     assert findings_of(demo_regions, demo_scene.cameras) == []
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [0, 1])
 def test_masks_with_faults_are_no_fault_of_the_poses(seed: int, demo_scene: Scene, demo_regions: Regions) -> None:
     maps = [degrade_labels(labels, Faults(), seed=9 * seed + view)
             for view, labels in enumerate(label_maps(demo_scene, demo_regions))]  # fmt: skip

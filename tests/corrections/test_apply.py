@@ -148,24 +148,16 @@ def test_a_later_edit_wins_and_the_earlier_one_says_so() -> None:
     assert fates(chain) == ["contradicted by edit 3", "applied", "applied"]
 
 
-def test_pieces_that_do_not_touch_are_named() -> None:
-    corrected = correct(link("same", ("a", 15, 15), ("a", 35, 15)))
-    said = "applied: a contradiction: its masks in view a do not touch"
-    assert findings_of(corrected) == [Finding("edit", values={"edit": 1, "op": "same", "why": said})]
-    chain = correct(link("same", ("a", 15, 15), ("b", 15, 15)), link("same", ("b", 15, 15), ("a", 35, 15)))
-    assert findings_of(chain) == [Finding("edit", values={"edit": 2, "op": "same", "why": said})]
-    bridged = [square(20, 10, 30, 20), link("same", ("a", 15, 15), ("a", 35, 15), ("a", 25, 15))]
-    assert findings_of(correct(*bridged)) == []
-    assert findings_of(correct(square(20, 10, 28, 20), link("same", ("a", 15, 15), ("a", 25, 15)))) == []
+def apply_known(*edits: dict[str, Any]) -> tuple[Masks, Corrected]:
+    """Edits once the instances of the masks are known."""
+    corrected = correct(*edits)
+    ids = torch.tensor([1, 2, 1, 2])[: len(corrected.masks)]
+    return apply_everywhere(corrected, Masks.of(corrected.masks.regions, ids, origin=Origin.DETECTED))
 
 
 def test_whole_instances_once_they_are_known() -> None:
-    ids = torch.tensor([1, 2, 1, 2])
-
     def after(*edits: dict[str, Any]) -> Masks:
-        corrected = correct(*edits)
-        known = Masks.of(corrected.masks.regions, ids[: len(corrected.masks)], origin=Origin.DETECTED)
-        return apply_everywhere(corrected, known)[0]
+        return apply_known(*edits)[0]
 
     assert after(at("reject", 15, 15, everywhere=True)).regions.boxes.tolist() == [[*RIGHT], [*RIGHT]]
     assert after(at("reject", 15, 15, everywhere=True)).instance_ids.tolist() == [2, 2]
@@ -178,12 +170,8 @@ def test_whole_instances_once_they_are_known() -> None:
 
 
 def test_an_edit_of_a_whole_instance_says_which_earlier_ones_it_overrides() -> None:
-    ids = torch.tensor([1, 2, 1, 2])
-
     def told(*edits: dict[str, Any]) -> list[str]:
-        corrected = correct(*edits)
-        known = Masks.of(corrected.masks.regions, ids[: len(corrected.masks)], origin=Origin.DETECTED)
-        return [each.fate for each in apply_everywhere(corrected, known)[1].fates]
+        return fates(apply_known(*edits)[1])
 
     everywhere = at("reject", 15, 15, everywhere=True)
     assert told(at("confirm", 15, 15, "b"), everywhere) == ["contradicted by edit 2", "applied"]
@@ -256,9 +244,6 @@ def test_an_outline_is_a_leaf_of_its_own_unless_links_say_otherwise() -> None:
     joined = correct(drawn, link("same", ("a", 25, 15), ("a", 15, 15)))
     assert [sorted(pair) for pair in joined.links.cannot.tolist()] == [[1, 2]]
     assert joined.masks.is_linked.tolist() == [True, False, True, False, False]
-
-
-def test_an_outline_over_everything_says_what_it_replaces() -> None:
     squares = [(5 * n, 10, 5 * n + 4, 20) for n in range(8)]
     masks = Masks.of(regions_from_label_maps([label_map(*squares), label_map()]))
     said = findings_of(correct(square(0, 0, 60, 40), masks=masks))
@@ -270,9 +255,8 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
     a mistake."""
     candidate = RejectedCandidate(0.3, Masks.of(regions_from_label_maps([label_map((40, 25, 55, 35)), label_map()])))
     other = RejectedCandidate(0.2, Masks.of(regions_from_label_maps([label_map((1, 25, 9, 35)), label_map()])))
-    corrected = correct(
-        at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
-    )
+    both = (at("reject", x, 30, everywhere=True) for x in (45, 25))
+    corrected = correct(*both, at("reject", 5, 30))
     assert fates(corrected) == ["points at nothing"] * 3
     plant = match_given(Opened(SCENE, Photos(SCENE), RunConfig(), given=MASKS))
     plant = replace(plant, edits=corrected.fates, refused=corrected.refused, rejected=(candidate, other))

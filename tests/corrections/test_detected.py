@@ -6,6 +6,7 @@ import io
 import zipfile
 import zlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,10 +47,10 @@ SCENE = Scene(name="plant", views=VIEWS, cameras=CAMERAS, unit="mm", up=None)
 FOUND = FoundMasks(Matching(MATCHED.select(IDS != WEAK), MatchReport("nview")), PROPOSALS, more=MATCHED)
 
 
-def fit(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:
+def fit(masks: Masks, _: Cameras, __: object, true: torch.Tensor = IDS) -> dict[int, LeafSurface]:
     ids = masks.instance_ids
     instances = ids[ids > 0].unique().tolist()
-    return {each: LEAVES[int(IDS[masks.regions.labels[ids == each]].mode().values)] for each in instances}
+    return {each: LEAVES[int(true[masks.regions.labels[ids == each]].mode().values)] for each in instances}
 
 
 def at(leaf: int, view: int) -> tuple[float, float]:
@@ -172,17 +173,11 @@ def test_sources_have_no_order_and_one_that_is_left_out_leaves_its_candidates_ou
 def test_two_masks_that_a_person_keeps_apart_never_have_one_id(monkeypatch: pytest.MonkeyPatch, leaf: int) -> None:
     """Although a candidate from before the edit holds both, and they are all that it has."""
     stays = (leaf != IDS) | torch.isin(REGIONS.view_index, torch.tensor([0, 3]))
-    few = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9)).select(stays)
+    few = MATCHED.select(stays)
     ids, rows = IDS[stays], torch.arange(int(stays.sum()))
     few = replace(few, regions=replace(few.regions, labels=rows), proposal=rows)
     see_masks(monkeypatch, FoundMasks(Matching(few.select(ids != WEAK), MatchReport("nview")), few, more=few))
-
-    def fit_few(masks: Masks, _: Cameras, __: object) -> dict[int, LeafSurface]:
-        matched = masks.instance_ids
-        instances = matched[matched > 0].unique().tolist()
-        return {each: LEAVES[int(ids[masks.regions.labels[matched == each]].mode().values)] for each in instances}
-
-    monkeypatch.setattr(choosing, "fit_roughly", fit_few)
+    monkeypatch.setattr(choosing, "fit_roughly", partial(fit, true=ids))
     together, apart = run(), run(Link(op="different", at=(("v0", *at(leaf, 0)), ("v3", *at(leaf, 3)))))
     assert [each.fate for each in apart.edits] == [APPLIED]
     for state, most in ((together, 2), (apart, 1)):

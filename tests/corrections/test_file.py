@@ -82,7 +82,10 @@ def test_faults_are_one_sentence(data: Any, message: str) -> None:
     assert len(str(caught.value)) < 250
 
 
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, '{"format": NaN}', "\udce4"])
+MILLION = '{"format": "mvseg-corrections/1", "edits": [' + "0," * 999_999 + "0]}"
+
+
+@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, '{"format": NaN}', "\udce4", MILLION], ids=len)
 def test_broken_files_are_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "corrections.json"
     path.write_bytes(text.encode("utf-8", "surrogateescape"))
@@ -101,13 +104,6 @@ def test_hostile_texts_stay_in_their_sentence(tmp_path: Path) -> None:
             parse_corrections(content(edit), tmp_path / "corrections.json")
         assert not set("\n\x1b") & set(str(caught.value))
         assert len(str(caught.value)) < 250 + len(str(tmp_path))
-
-
-def test_a_million_edits_are_refused_at_once(tmp_path: Path) -> None:
-    path = tmp_path / "corrections.json"
-    path.write_text('{"format": "mvseg-corrections/1", "edits": [' + "0," * 999_999 + "0]}", encoding="utf-8")
-    with pytest.raises(InputError, match="edit 1: Input should be a valid dictionary"):
-        load_corrections(path)
 
 
 def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:

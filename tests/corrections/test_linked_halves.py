@@ -49,14 +49,11 @@ def test_halves_are_linked_in_all_photos_that_show_both(views: tuple[int, int]) 
     assert int(linked.masks.is_linked.sum()) >= 6  # and nothing else takes them away
 
 
-def test_a_link_between_two_leaves_that_touch_is_about_one_mask() -> None:
+def test_a_link_between_two_leaves_or_what_is_kept_apart_is_about_one_mask() -> None:
     leaves = {1: LEAVES[1], 2: LEAVES[2], 3: flat_leaf(length=0.9, half_width=0.2, at=(0.75, -0.3, 0.4))}
     linked = link(true_maps(leaves), (1, 3), (0, 2))
     assert len(linked.links.must) == 1
     assert not linked.masks.is_linked.any()
-
-
-def test_what_a_person_keeps_apart_stays_apart() -> None:
     maps = halved_maps(ALL)
     regions, ids = as_regions(maps)
     here = regions.view_index == 3

@@ -30,8 +30,8 @@ from mvseg.verification.choose import Edited, Judges, choose_leaves
 from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
 from verified import verify_ids
-from warned import warns_of
 
+Said = pytest.CaptureFixture[str]
 IDS_ONLY = RunConfig(reconstruct=None)
 SQUARE = np.array([[-9.0, -9], [-9, 9], [9, 9], [9, -9]])
 
@@ -96,10 +96,10 @@ def test_edits_do_not_estimate_the_reprojection_error_again(plant: Path, monkeyp
 
     monkeypatch.setattr("mvseg.pipeline.apply_edits.match_masks", match)
     matched = match_given(open_scene(plant, plant / "masks", IDS_ONLY))
-    outlines = {(view, ball): np.array(middle(plant, view, ball)) + SQUARE for view in range(4) for ball in (1, 2)}
     drawn = [
-        {"op": "outline", "view": f"{view:03d}", "polygon": polygon.tolist()} for (view, _), polygon in outlines.items()
-    ]
+        {"op": "outline", "view": f"{view:03d}", "polygon": (middle(plant, view, ball) + SQUARE).tolist()}
+        for view in range(4) for ball in (1, 2)
+    ]  # fmt: skip
     apply_edits(matched, corrections({"op": "different", "at": [place(plant, 0, 1), place(plant, 3, 1)]}))
     apply_edits(matched, corrections(*drawn))
     assert asked == [matched.matching.report.residual_px, None]
@@ -112,9 +112,7 @@ def id_at(result: Result, plant: Path, view: int, ball: int) -> int:
     return int(result.masks.instance_ids[labels[y, x] - 1])
 
 
-def test_the_command_writes_what_came_of_each_edit(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_what_came_of_each_edit(plant: Path, tmp_path: Path, capsys: Said) -> None:
     path, out = tmp_path / "corrections.json", tmp_path / "out"
     square = {"op": "outline", "view": "000", "polygon": [[2, 2], [12, 2], [12, 12], [2, 12]]}
     path.write_text(json.dumps({"format": FORMAT, "edits": [square, {"op": "reject", "view": "000", "at": [127, 1]}]}))
@@ -217,9 +215,3 @@ def test_two_outlines_of_one_leaf_show_it_in_all_views(tmp_path: Path) -> None:
     assert min(ious[0], ious[3]) > 0.7
     assert min(ious.values()) > 0.75  # with the outlines alone: 0.24 to 0.62
     assert own.origin.tolist().count(Origin.OTHER_VIEWS) == len(views) - 2
-
-
-def test_an_edit_that_points_at_nothing_is_warned_of(plant: Path) -> None:
-    said = corrections({"op": "confirm", "view": "none", "at": [1, 1]})
-    with warns_of("edit"):
-        run_scene(plant, plant / "masks", IDS_ONLY, corrections=said)

@@ -47,7 +47,9 @@ def test_another_plant_with_the_same_names_is_refused(tmp_path: Path) -> None:
         check_made_for(replace(made, photos=wider), Photos(load_scene(other)))
 
 
-def test_a_run_stops_unless_it_is_forced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_stops_unless_it_is_forced_or_the_file_does_not_say(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path, other = tmp_path / "corrections.json", write_scene(tmp_path / "others")
     write_corrections(path, corrections_of(write_scene(tmp_path / "balls")))
     write_png(other / "images" / "001.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
@@ -56,10 +58,7 @@ def test_a_run_stops_unless_it_is_forced(tmp_path: Path, capsys: pytest.CaptureF
     assert capsys.readouterr().err.count("was made for another scene") == 1
     assert not (tmp_path / "out" / "others").exists()
     assert main([*command, "--force_corrections", "true"]) == 0
-
-
-def test_a_file_that_does_not_say_is_taken_with_a_warning(tmp_path: Path) -> None:
-    scene = load_scene(write_scene(tmp_path / "balls"))
+    scene = load_scene(tmp_path / "balls")
     old = Corrections((Confirm(view="001", at=(1.0, 1.0)),), source=Path("old.json"))
     with warns_of("edits_of_unknown_photos"):
         check_made_for(old, Photos(scene))

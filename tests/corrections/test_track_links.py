@@ -21,10 +21,14 @@ def write(path: Path, *edits: dict[str, Any]) -> Path:
     return path
 
 
+def write_results(folder: Path, *names: str, view: str = "000") -> dict[str, Path]:
+    for name in names:
+        write_result(folder / name, grow_blades(3, 1), view=view)
+    return {name: folder / name for name in names}
+
+
 def test_points_become_leaves(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_result(tmp_path / name, grow_blades(3, 1))
-    folders = {name: tmp_path / name for name in ("a", "b")}
+    folders = write_results(tmp_path, "a", "b")
     path = write(
         tmp_path / "corrections.json",
         {"op": "reject", "view": "000", "at": [1.0, 2.0]},  # of a single scene
@@ -38,9 +42,7 @@ def test_points_become_leaves(tmp_path: Path) -> None:
 
 
 def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
-    for place in ("mon/plant", "fri/plant"):
-        write_result(tmp_path / place, grow_blades(3, 1))
-    folders = {place: tmp_path / place for place in ("mon/plant", "fri/plant")}
+    folders = write_results(tmp_path, "mon/plant", "fri/plant")
     path = write(
         tmp_path / "corrections.json",
         {"op": "same_track", "at": [["mon/plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
@@ -52,10 +54,8 @@ def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
 
 
 def test_views_in_folders_are_found_by_any_name_that_fits_one(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        write_result(tmp_path / name, grow_blades(3, 1), view="left/000")
+    folders = write_results(tmp_path, "a", "b", view="left/000")
     write_label_png(tmp_path / "b" / "labels" / "right" / "000.png", np.zeros((40, 60), np.uint16))  # two are named 000
-    folders = {name: tmp_path / name for name in ("a", "b")}
     for view in ("left/000", "left/000.jpg", "left\\000.png"):
         edit = {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", view, 30.2, 20]]}
         links, lost = find_links(load_corrections(write(tmp_path / "corrections.json", edit)).edits, folders)
@@ -66,9 +66,7 @@ def test_views_in_folders_are_found_by_any_name_that_fits_one(tmp_path: Path) ->
 
 
 def test_a_later_link_wins(tmp_path: Path) -> None:
-    for name in ("a", "b", "c"):
-        write_result(tmp_path / name, grow_blades(3, 1))
-    x = {1: 5.5, 2: 30.2, 3: 50.0}
+    folders, x = write_results(tmp_path, "a", "b", "c"), {1: 5.5, 2: 30.2, 3: 50.0}
 
     def edit(op: str, *leaves: tuple[str, int]) -> dict[str, Any]:
         return {"op": op, "at": [[scene, "000", x[leaf], 20] for scene, leaf in leaves]}
@@ -82,7 +80,7 @@ def test_a_later_link_wins(tmp_path: Path) -> None:
         edit("same_track", ("a", 3), ("a", 2)),
         edit("same_track", ("a", 3), ("b", 2)),
     )
-    links, lost = find_links(load_corrections(path).edits, {name: tmp_path / name for name in ("a", "b", "c")})
+    links, lost = find_links(load_corrections(path).edits, folders)
     assert links == [
         LeafLink(True, (("b", 1), ("c", 2))),
         LeafLink(False, (("a", 1), ("b", 1))),
@@ -97,11 +95,8 @@ def test_a_later_link_wins(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("view", ["nothing", "../labels/000", "/etc/x"])
 def test_views_that_are_not_there(tmp_path: Path, view: str) -> None:
-    for name in ("a", "b"):
-        write_result(tmp_path / name, grow_blades(3, 1))
-    folders = {name: tmp_path / name for name in ("a", "b")}
     path = write(tmp_path / "c.json", {"op": "same_track", "at": [["a", view, 900, 900], ["b", "000", 5.5, 20]]})
-    assert find_links(load_corrections(path).edits, folders)[0] == []
+    assert find_links(load_corrections(path).edits, write_results(tmp_path, "a", "b"))[0] == []
 
 
 @pytest.mark.parametrize("at", [None, [["a", "000", 1, 2]], [["a", 1], ["b", 2]]])

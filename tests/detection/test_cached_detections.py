@@ -108,13 +108,6 @@ class TestClaim:
             delete_cached(kept)
         assert list(tmp_path.iterdir()) == []
 
-    def test_detections_that_say_nothing_of_their_photos_are_not_taken(self, tmp_path: Path) -> None:
-        keep(tmp_path / "kept")
-        with pytest.raises(InputError, match="kept: holds detections, but not of which photos"):
-            claim_cache(tmp_path / "kept", tmp_path).__enter__()
-        with claim_cache(tmp_path / "kept", tmp_path, overwrite=True) as holds_some:
-            assert holds_some
-
     def test_by_one_run_at_a_time(self, tmp_path: Path) -> None:
         with claim_cache(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
             claim_cache(tmp_path / "kept", tmp_path).__enter__()
@@ -134,11 +127,12 @@ def test_a_detector_that_proposes_masks_everywhere_is_bounded_and_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, config = load_scene(write_scene(tmp_path / "plant", 2)), DetectConfig(min_score=0.2)
-    everything = detect_scene(Photos(scene), config).proposals()
+    kept = CachedDetections(tmp_path / "kept")
+    everything = detect_scene(Photos(scene), config, cache=kept).proposals()
     assert everything.regions.num_per_view.min() > 2
     monkeypatch.setattr("mvseg.detection.detect_scene.DETECTION", replace(DETECTION, most_proposals=2))
     with warns_of("very_many_proposals"):
-        best = detect_scene(Photos(scene), config).proposals()
+        best = detect_scene(Photos(scene), config, cache=kept).proposals()
     assert best.regions.num_per_view.tolist() == [2, 2]
     for view in range(2):
         scores = everything.detection_scores[everything.view_index == view]
@@ -158,7 +152,7 @@ def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene, keep = load_scene(write_scene(tmp_path / "plant", 3)), tmp_path / "kept"
+    scene, keep = load_scene(write_scene(tmp_path / "plant", 2)), tmp_path / "kept"
     config = DetectConfig(min_score=0.2)
     whole = detect_scene(Photos(scene), config).sure.masks
     assert len(whole.regions)
@@ -167,21 +161,21 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monk
 
     def count(model: object, photo: torch.Tensor, **options: object) -> dict[str, torch.Tensor]:
         ran.append(tuple(photo.shape))
-        if len(ran) == 3:
+        if len(ran) == 2:
             raise KeyboardInterrupt
         return run_heads(model, photo, **options)  # type: ignore[arg-type]
 
     monkeypatch.setattr(proposing, "run_heads", count)
     with pytest.raises(KeyboardInterrupt):
         detect_scene(Photos(scene), config, cache=CachedDetections(keep))
-    assert len(list(keep.iterdir())) == 2
+    assert len(list(keep.iterdir())) == 1
     resumed = detect_scene(Photos(scene), config, cache=CachedDetections(keep)).sure.masks
-    assert len(ran) == 3 + 1  # the first two photos were not looked at again
+    assert len(ran) == 2 + 1  # the first photo was not looked at again
     assert torch.equal(resumed.regions.crops, whole.regions.crops)
     assert torch.equal(resumed.detection_scores, whole.detection_scores)
     assert torch.equal(resumed.instance_ids, whole.instance_ids)
     other = CachedDetections(keep)
     detect_scene(Photos(scene), DetectConfig(min_score=0.04), cache=other)
-    assert len(ran) == 3 + 1 + 3
+    assert len(ran) == 2 + 1 + 2
     delete_cached(keep, but=other.used)
-    assert len(list(keep.iterdir())) == 3  # those of other options are gone
+    assert len(list(keep.iterdir())) == 2  # those of other options are gone

@@ -6,11 +6,8 @@ from functools import cache
 import pytest
 import torch
 from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn
-from torchvision.models.detection.anchor_utils import AnchorGenerator
-from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
-from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.models.detection.roi_heads import paste_masks_in_image
-from torchvision.ops import MultiScaleRoIAlign, box_iou
+from torchvision.ops import box_iou
 
 from mvseg.demo import demo_scene
 from mvseg.detection.loop import match_proposals
@@ -32,37 +29,18 @@ from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from simulated_proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at
+from tiny_training import build_tiny
 
 # what an untrained detector finds in noise does not agree across views
 pytestmark = pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
 
 
-class TinyBackbone(torch.nn.Sequential):
-    out_channels = 8
-
-    def __init__(self) -> None:
-        super().__init__(torch.nn.Conv2d(3, 8, 7, stride=16, padding=3), torch.nn.ReLU())
-
-
 def tiny_detector() -> MaskRCNN:
-    """An untrained Mask R-CNN that answers in milliseconds, and calls almost everything an object."""
-    torch.manual_seed(0)
-    detector = MaskRCNN(
-        TinyBackbone(),
-        min_size=96,
-        max_size=128,
-        rpn_anchor_generator=AnchorGenerator(((24, 48),), ((0.5, 1.0, 2.0),)),
-        box_score_thresh=0.05,
-        box_detections_per_img=12,
-        rpn_post_nms_top_n_test=25,
-        box_roi_pool=MultiScaleRoIAlign(["0"], 7, 2),
-        box_head=TwoMLPHead(8 * 7**2, 32),
-        box_predictor=FastRCNNPredictor(32, 3),
-        mask_roi_pool=MultiScaleRoIAlign(["0"], 14, 2),
-        mask_head=MaskRCNNHeads(8, (8,), 1),
-        mask_predictor=MaskRCNNPredictor(8, 8, 3),
-    )
-    return detector.eval()
+    """It answers in milliseconds, and calls almost everything an object."""
+    detector = build_tiny(3).eval()
+    detector.transform.min_size, detector.transform.max_size = (96,), 128
+    detector.roi_heads.detections_per_img = 12
+    return detector
 
 
 def some_images(count: int = 3, width: int = 160, height: int = 120) -> list[torch.Tensor]:
@@ -215,7 +193,7 @@ def test_crops_hold_exactly_what_torchvision_pastes() -> None:
 
 @cache
 def crowded_scene() -> tuple[BallScene, Masks, torch.Tensor]:
-    scene = ball_scene(14, 8, seed=3, radius=0.5, spread=1.3)
+    scene = ball_scene(14, 6, seed=3, radius=0.5, spread=1.3)
     proposals, labels = simulate_proposals(scene.label_maps, seed=0)
     excess = plain_nms(proposals, 0.7)
     chosen = proposals.select(excess)
@@ -252,7 +230,7 @@ def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
         )
         if most > 0.4
     ]
-    assert len(crowded) >= 8
+    assert len(crowded) >= 6
 
     def recall(keep: torch.Tensor) -> float:
         kept = set(zip(proposals.regions.view_index[keep].tolist(), labels[keep].tolist(), strict=True))

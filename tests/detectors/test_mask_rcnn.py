@@ -15,10 +15,7 @@ from torch import Tensor, nn
 from torchvision.models.detection import MaskRCNN
 from torchvision.ops import FrozenBatchNorm2d
 
-from mvseg.detectors.mask_rcnn import (
-    build_bare,
-    build_detector,
-)
+from mvseg.detectors.mask_rcnn import build_bare, build_detector
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 
@@ -136,8 +133,8 @@ def test_batch_norm_checkpoint_is_frozen_without_changing_its_answers(arch: str,
     trained.transform = loaded.transform
     assert_same(detect(loaded), detect(trained))
     save_file(loaded.state_dict(), tmp_path / "frozen.safetensors")
-    again = build_detector(arch, 2, str(tmp_path / "frozen.safetensors"), image_size=64)
-    assert_same(detect(again), detect(loaded))
+    again = build_detector(arch, 2, str(tmp_path / "frozen.safetensors")).state_dict()
+    assert all(torch.equal(again[key], value) for key, value in loaded.state_dict().items())
 
 
 @pytest.mark.parametrize(

@@ -16,16 +16,13 @@ STATE = {"weight": torch.arange(6.0).reshape(2, 3), "bias": torch.ones(2)}
 DESCRIPTION = Description("resnet18_fpn", ("leaf", "Stängel"), 320)
 
 
-def test_weights_and_description_come_back(tmp_path: Path) -> None:
+def test_weights_and_description_come_back_and_those_of_others_have_none(tmp_path: Path) -> None:
     path = tmp_path / "model.safetensors"
     path.write_bytes(encode_weights({**STATE, "weight": STATE["weight"].T}, DESCRIPTION))
     state, description = read_weights(path)
     assert description == DESCRIPTION
     assert torch.equal(state["weight"], STATE["weight"].T)  # a view, written out
     assert torch.equal(load_file(path)["bias"], STATE["bias"])
-
-
-def test_weights_of_others_have_no_description(tmp_path: Path) -> None:
     save_file(STATE, tmp_path / "model.safetensors", {"format": "pt"})
     torch.save(STATE, tmp_path / "model.pt")
     for name in ("model.safetensors", "model.pt"):

@@ -23,9 +23,9 @@ from tiny_training import make_config, write_finished_run, write_photos
 SHIPPED = [entry.name for entry in list_detectors()]
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    return write_finished_run(tmp_path / "run")
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_finished_run(tmp_path_factory.mktemp("zoo") / "run")
 
 
 @pytest.fixture
@@ -61,7 +61,9 @@ def test_photos_are_scaled_down_never_up_unless_a_size_is_asked_for(packed: Path
         assert model(photos[1:])[0]["masks"].shape[1:] == (1, 40, 60)
 
 
-def test_a_packed_run_loads_with_its_own_size_and_classes(run: Path, packed: Path) -> None:
+def test_a_packed_run_loads_with_its_own_size_and_classes_and_has_the_hash_of_sha256sum(
+    run: Path, packed: Path
+) -> None:
     model = load_detector("leaf-test")
     assert model.transform.max_size == 96
     assert model.roi_heads.box_predictor.cls_score.out_features == 4
@@ -72,9 +74,6 @@ def test_a_packed_run_loads_with_its_own_size_and_classes(run: Path, packed: Pat
         stored = model.state_dict()[key]
         assert stored.dtype == value.dtype
         torch.testing.assert_close(stored, value, rtol=1e-3, atol=1e-6)
-
-
-def test_the_hash_is_the_one_of_sha256sum(packed: Path) -> None:
     line = (packed / zoo.HASH).read_text()
     assert line == f"{hashlib.sha256((packed / zoo.WEIGHTS).read_bytes()).hexdigest()}  {zoo.WEIGHTS}\n"
 

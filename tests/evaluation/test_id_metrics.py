@@ -41,16 +41,13 @@ def test_ari_is_scikit_learns(seed: int) -> None:
     assert metrics.ari == pytest.approx(adjusted_rand_score(true, estimated), abs=1e-12)
 
 
-def test_unmatched_regions_are_clusters_of_their_own() -> None:
+def test_unmatched_regions_and_degenerate_cases() -> None:
     true = torch.tensor([1, 1, 2, 2])
     unmatched = matching_metrics(torch.tensor([-1, -1, 0, 0]), true)
     single = matching_metrics(torch.tensor([1, 2, 0, 0]), true)
     assert unmatched == single
     assert unmatched.num_estimated == 3
     assert matching_metrics(torch.full((4,), -1), true).s_match == 1  # why s_match is never read alone
-
-
-def test_degenerate_cases() -> None:
     nothing = torch.zeros(0, dtype=torch.int64)
     assert matching_metrics(nothing, nothing).ari == 1
     alone = matching_metrics(torch.tensor([0, 1]), torch.tensor([3, 4]))

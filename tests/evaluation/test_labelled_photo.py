@@ -40,9 +40,6 @@ def test_instances_share_layers_where_they_can() -> None:
     assert [layer.unique().tolist() for layer in layers] == [[0, 1, 3], [0, 2]]
     for number, mask in enumerate((SQUARE, BAR, CORNER), start=1):
         np.testing.assert_array_equal((layers == number).any(0), mask)
-
-
-def test_no_masks_are_one_empty_layer() -> None:
     labelled = mask_photo(PHOTO, [], classes=[], ignore=CORNER)
     assert (labelled.classes.dtype, len(labelled.classes)) == (torch.int64, 0)
     assert labelled.layers.shape == (1, HEIGHT, WIDTH)

@@ -10,7 +10,7 @@ import torch
 
 from mvseg.crop import Crop
 from mvseg.errors import InputError
-from mvseg.evaluation.panoptic import SharedLeaf, compare_annotators, leaf_metrics
+from mvseg.evaluation.panoptic import compare_annotators, leaf_metrics
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from reference import leaf_metrics_reference
 
@@ -90,9 +90,6 @@ def test_misses_and_false_leaves_cost_half_each() -> None:
     assert metrics.mv_pq == pytest.approx(2 / (2 + 1 / 2 + 1 / 2))
     assert (metrics.num_right, metrics.num_false, metrics.num_missed) == (2, 1, 1)
     assert (metrics.mask_precision, metrics.mask_recall) == (pytest.approx(2 / 3), pytest.approx(2 / 3))
-
-
-def test_nothing_found_and_nothing_to_find() -> None:
     nothing, leaf = [np.zeros((2, 3), int)], [np.array([[0, 4, 4]])]
     none = regions_from_label_maps(nothing)
     assert leaf_metrics(none, none.labels, nothing).mv_pq == 1
@@ -130,10 +127,10 @@ def test_leaves_of_two_annotators_are_named_by_both() -> None:
     other = drawn({7: LEFT, 5: RIGHT}, {7: LEFT, 5: RIGHT}, {7: LEFT, 5: RIGHT}, {7: LEFT, 6: RIGHT})
     regions = regions_from_label_maps(one)
     found = compare_annotators(regions, regions.labels, other)
-    assert found.shared == (SharedLeaf(3, 7, 3 * 80 / 400), SharedLeaf(4, 5, 300 / 380))
+    assert found.shared == ((3, 7, 3 * 80 / 400), (4, 5, 300 / 380))
     assert (found.alone, found.missed) == ((9,), (6,))
     back = regions_from_label_maps(other)
     again = compare_annotators(back, back.labels, one)
-    assert [(each.true, each.leaf) for each in again.shared] == [(4, 5), (3, 7)]
+    assert [(true, leaf) for leaf, true, _ in again.shared] == [(4, 5), (3, 7)]
     unmatched = torch.where(regions.labels == 9, -1, regions.labels)
     assert compare_annotators(regions, unmatched, other).alone == ()

@@ -53,9 +53,6 @@ def test_sentences_tell_and_ask_in_one_breath() -> None:
         assert not sentence.endswith("."), code
         assert all(name for _, name, _, _ in Formatter().parse(sentence) if name is not None), code
         assert not re.search(r"of what|of those that|of these that", sentence), code
-
-
-def test_a_finding_of_no_view_is_none() -> None:
     rules = [("grey_photo", "note", [1], {}), ("dark_photo", "warning", [], {}), ("unknown_up", "note", None, {})]
     found = list_findings(rules, ("a", "b"))  # type: ignore[arg-type]
     assert found == [Finding("grey_photo", "view 1 (b)", views=(1,), level="note"), Finding("unknown_up", level="note")]

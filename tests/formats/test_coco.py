@@ -16,7 +16,6 @@ from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
 from mvseg.errors import InputError
-from mvseg.findings.finding import Finding
 from mvseg.formats.coco import read_coco, write_coco
 from mvseg.formats.masks.view_regions import stack_views
 from mvseg.formats.run_lengths import decode_rle, encode_mask
@@ -101,16 +100,13 @@ def test_all_three_encodings_give_one_mask(scene: Scene, tmp_path: Path) -> None
         np.testing.assert_array_equal(mask, expected)
 
 
-def test_a_polygon_without_a_list_around_it(scene: Scene, tmp_path: Path) -> None:
+def test_files_of_via(scene: Scene, tmp_path: Path) -> None:
     """VIA writes so, with the image's id as text."""
     expected = read_one(tmp_path, scene, [POLYGON])
     np.testing.assert_array_equal(read_one(tmp_path, scene, POLYGON), expected)
     path = write(tmp_path, [{"segmentation": POLYGON, "image_id": "10"}])
     np.testing.assert_array_equal(read_all(path, scene)[0][0][1], expected)
     assert not read_one(tmp_path, scene, POLYGON[:4]).any()  # a line
-
-
-def test_files_of_via_that_are_no_coco(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "via.json").write_text(json.dumps({"a.jpg9": {"filename": "a.jpg", "size": 9, "regions": []}}))
     with pytest.raises(InputError, match=r"via.json: images: Field required, expected COCO"):
         read_coco(tmp_path / "via.json", scene)
@@ -140,10 +136,6 @@ def test_crowds_are_masks_unless_told_otherwise(scene: Scene, tmp_path: Path) ->
         assert [number for number, _ in read_all(path, scene, crowd="ignore")[0]] == [1, 3]
 
 
-def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> None:
-    assert read_all(write(tmp_path, []), scene) == [[], []]
-
-
 def test_masks_of_many_photos_are_never_in_memory_together(tmp_path: Path) -> None:
     scene = make_scene(*[f"images/{view}.jpg" for view in range(8)])
     side, per_view = 1000, 6
@@ -169,21 +161,16 @@ NEITHER = "its segmentation is neither polygons of finite numbers nor run length
 BAD: list[tuple[Any, str]] = [
     ({"size": [HEIGHT, WIDTH], "counts": encode_mask(random_mask(0))["counts"][:-9]}, "do not add up to 60 x 40"),
     ({"size": [HEIGHT, WIDTH], "counts": ""}, "do not add up to 60 x 40"),
-    ({"size": [HEIGHT, WIDTH], "counts": "zzzzzzzz"}, "do not add up to 60 x 40"),
     ({"size": [HEIGHT, WIDTH], "counts": "ü~"}, "do not add up to 60 x 40"),
     ({"size": [HEIGHT, WIDTH], "counts": [100, 100]}, "do not add up to 60 x 40"),
-    ({"size": [HEIGHT, WIDTH], "counts": [0, WIDTH * HEIGHT + 1]}, "do not add up to 60 x 40"),
     ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, expected 60 x 40"),
     ({"size": [10**9, 10**9], "counts": "PPYo1"}, "its mask is 1000000000 x 1000000000"),
-    ([[], []], "expected polygons"),
     ([[*POLYGON, 3.0]], "expected polygons"),
     ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "reaches far out of the image"),
     ([[-500.0, 0.0, 560.0, 40.0] * 3000], "polygons are 6[0-9]* pixels long, more than any outline in the image"),
     ({"size": [HEIGHT, WIDTH], "counts": "o" * 100_000 + "1"}, "are not a string that COCO writes"),
     ({"size": [HEIGHT, WIDTH], "counts": [-5, WIDTH * HEIGHT + 5]}, NEITHER),
-    ({"size": [HEIGHT, WIDTH], "counts": ["a"]}, NEITHER),
     ({"counts": [WIDTH * HEIGHT]}, NEITHER),
-    ({"size": [HEIGHT, WIDTH]}, NEITHER),
     ([[1.0, 2.0, float("nan"), 4.0, 5.0, 6.0]], NEITHER),
     ([[1.0, 2.0, 10**400, 4.0, 5.0, 6.0]], NEITHER),
     ("circle", NEITHER),
@@ -201,9 +188,6 @@ def test_views_that_the_file_does_not_list_are_empty_and_named(scene: Scene, tmp
     with warns_of("images_missing"):
         masks = read_all(write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "c.jpg")), scene)
     assert [len(view) for view in masks] == [1, 0]
-
-
-def test_a_file_of_other_photos_says_what_it_holds(scene: Scene, tmp_path: Path) -> None:
     files = ("c.jpg", "d.jpg", "e.jpg", "f.jpg", "g.jpg")
     message = r"none of its images is a photo of the scene, expected a.jpg, b.jpg, found c.jpg, d.jpg, e.jpg and 2 more"
     with pytest.raises(InputError, match=message):
@@ -267,10 +251,8 @@ def test_lists_of_results(tmp_path: Path) -> None:
 
 def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": each} for each in ([POLYGON], [OTHER], [POLYGON])])
-    with warns_of("masks_in_one_view") as noticed:
-        regions = load_masks(scene, path)
-    assert regions.labels.tolist() == [1, 2]
-    assert Finding("masks_twice", str(path), {"count": 1, "total": 3}) in noticed
+    with warns_of("copies"):
+        assert load_masks(scene, path).labels.tolist() == [1, 2]
     write(tmp_path, [{"segmentation": [POLYGON], "image_id": each} for each in (10, 12)], ("a.jpg", "b.jpg", "a.jpg"))
     with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are of one photo, and both have annot"):
         read_all(path, scene)
@@ -333,10 +315,8 @@ def test_other_image_size(scene: Scene, tmp_path: Path) -> None:
 def test_written_file_reads_back_here_and_in_pycocotools(
     scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    masks = [random_mask(seed) for seed in range(3)]
-    images = [
-        {"id": i + 1, "file_name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT} for i, name in enumerate("ab")
-    ]
+    masks, size = [random_mask(seed) for seed in range(3)], {"width": WIDTH, "height": HEIGHT}
+    images = [{"id": number, "file_name": f"{name}.jpg"} | size for number, name in ((1, "a"), (2, "b"))]
     annotations = [
         {"image_id": 1 + number % 2, "instance_id": number, "segmentation": encode_mask(mask)}
         for number, mask in enumerate(masks)
@@ -352,9 +332,7 @@ def test_written_file_reads_back_here_and_in_pycocotools(
         rows, columns = masks[number].nonzero()
         assert one["area"] == masks[number].sum()
         left, top, width, height = one["bbox"]
-        assert (left, left + width, top, top + height) == (
-            columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-        )  # fmt: skip
+        assert [left, left + width, top, top + height] == [min(columns), max(columns) + 1, min(rows), max(rows) + 1]
         assert (one["instance_id"], one["category_id"], one["iscrowd"]) == (number, 1, 0)
 
 

@@ -56,15 +56,12 @@ def test_a_name_that_fits_by_itself_beats_base_names() -> None:
     assert find_views(["5f1c0e7a-day.jpg", "day.1.JPG.png"], scene, source=Path("masks")) == [0, 1]
 
 
-def test_names_that_fit_several_views() -> None:
+def test_names_that_fit_several_views_or_loosely() -> None:
     scene = scene_of("images/left/1.jpg", "images/right/1.jpg", "images/2.jpg")
     with pytest.raises(InputError, match=r"masks: image 1.jpg could be view 0 \(left/1\) or 1 \(right/1\)"):
         find_views(["1.jpg"], scene, source=Path("masks"))
     with pytest.raises(InputError, match=r"masks: both a/2.jpg and b/2.jpg could be view 2 \(2\), expected the path"):
         find_views(["a/2.jpg", "b/2.jpg"], scene, source=Path("masks"))
-
-
-def test_only_loose_names_are_said() -> None:
     scene, names = scene_of("images/1.jpg", "images/2.jpg"), ["1.jpg", "old/2.jpg"]
     with warns_of("base_names"):
         find_views(names, scene, source=Path("masks"), warn_of_loose=True)

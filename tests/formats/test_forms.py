@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import math
+import struct
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -15,7 +16,7 @@ import pytest
 import torch
 from PIL import Image
 
-from mvseg.checks.poses import PoseAgreement, pairwise_agreement
+from mvseg.checks.poses import pairwise_agreement
 from mvseg.checks.turned_masks import low_fit_findings, take_out_of_square, transpose
 from mvseg.cli.options import CAN_BE_OFF, _with_words
 from mvseg.config import RunConfig
@@ -26,8 +27,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.formats.transforms_json import read_transforms
-from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.scene import Cameras
+from mvseg.regions import regions_from_label_maps
 from mvseg.traits.config import TraitsConfig
 from scene_folders import HEIGHT, WIDTH, write_scene
 from warned import warns_of
@@ -44,7 +44,7 @@ def labels_of(plant: Path) -> list[np.ndarray]:
 
 def write_each(plant: Path, write: Callable[[Path, np.ndarray], None]) -> Path:
     folder = plant / "other"
-    folder.mkdir()
+    folder.mkdir(exist_ok=True)
     for view, labels in enumerate(labels_of(plant)):
         write(folder / f"{view:03d}", labels)
     return folder
@@ -134,10 +134,6 @@ def test_corners_of_larger_photos_and_polygons_of_two_points(plant: Path) -> Non
         load_masks(load_scene(plant), path)
 
 
-def test_palettes_that_were_ordered_anew(plant: Path) -> None:
-    assert same(plant, write_each(plant, write_palette))
-
-
 @pytest.mark.parametrize("is_palette", [False, True])
 def test_255_as_the_background(plant: Path, is_palette: bool) -> None:
     def write(path: Path, numbers: np.ndarray) -> None:
@@ -151,7 +147,8 @@ def test_255_as_the_background(plant: Path, is_palette: bool) -> None:
         same(plant, write_each(plant, lambda path, labels: write(path, labels.astype(int) - 1 & 255)))
 
 
-def test_255_around_leaves_from_1_on_is_nothing(plant: Path) -> None:
+def test_palettes_that_were_ordered_anew_and_255_around_leaves_from_1_on(plant: Path) -> None:
+    assert same(plant, write_each(plant, write_palette))
     masks = write_each(plant, lambda path, labels: Image.fromarray(  # type: ignore[arg-type,return-value]
         np.where(labels == 0, 255, labels).astype(np.uint8)).save(path.with_suffix(".png")))  # fmt: skip
     assert same(plant, masks)
@@ -164,7 +161,7 @@ def test_the_number_of_the_plant_as_group(plant: Path) -> None:
 
 def test_other_programs_and_numbers_name_the_mend(plant: Path) -> None:
     (plant / "annotations.xml").write_text("<?xml version='1.0'?>\n<annotations></annotations>")
-    with pytest.raises(InputError, match=r"annotations.xml: is CVAT's XML, expected its export 'COCO 1.0'"):
+    with pytest.raises(InputError, match=r"annotations.xml: is XML, expected CVAT's export 'COCO 1.0'"):
         load_masks(load_scene(plant), plant / "annotations.xml")
     (plant / "cam.yaml").write_text(
         "cam0: {camera_model: pinhole, distortion_coeffs: [0, 0, 0, 0], intrinsics: [1, 1, 1, 1]}"
@@ -229,10 +226,6 @@ def test_the_angle_of_a_frame_goes_before_the_focal_length_of_the_file(tmp_path:
     assert float(K[0, 0]) == 150
 
 
-def agree(regions: Regions, cameras: Cameras) -> PoseAgreement:
-    return pairwise_agreement(regions, cameras)
-
-
 def test_letterboxes_are_named_and_taken_out() -> None:
     scene = load_scene(demo_scene())
     truth = load_masks(scene, demo_scene() / "masks")
@@ -244,20 +237,18 @@ def test_letterboxes_are_named_and_taken_out() -> None:
         square[(width - height) // 2 : (width + height) // 2] = labels
         boxed.append(np.asarray(Image.fromarray(square).resize((width, height), Image.Resampling.NEAREST)))
     regions = regions_from_label_maps(boxed)
-    (finding,) = low_fit_findings(regions, scene.cameras, agree(regions, scene.cameras))
+    (finding,) = low_fit_findings(regions, scene.cameras, pairwise_agreement(regions, scene.cameras))
     assert finding.code == "letterboxed_masks"
     back = take_out_of_square(regions, scene.cameras)
     areas = {(int(v), int(n)): int(a) for v, n, a in zip(truth.view_index, truth.labels, truth.areas, strict=True)}
     again = [areas[int(v), int(n)] for v, n in zip(back.view_index, back.labels, strict=True)]
     assert np.median(np.abs(back.areas.numpy() / again - 1)) < 0.03
-    assert not low_fit_findings(truth, scene.cameras, agree(truth, scene.cameras))
+    assert not low_fit_findings(truth, scene.cameras, pairwise_agreement(truth, scene.cameras))
     twice = transpose(transpose(regions, scene.cameras), scene.cameras)
     assert torch.equal(twice.crops, regions.crops)
 
 
 def test_tiffs_of_64_bits(plant: Path) -> None:
-    import struct
-
     masks = write_each(
         plant, lambda path, labels: Image.fromarray(labels.astype(np.uint16)).save(path.with_suffix(".tif"))
     )  # type: ignore[arg-type,return-value]

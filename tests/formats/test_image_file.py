@@ -91,13 +91,10 @@ def test_the_head_tells_the_size_and_the_bits(name: str, tmp_path: Path) -> None
         read_image_size(tmp_path / "absent")
 
 
-def test_a_film_behind_a_jpeg_does_no_harm(tmp_path: Path) -> None:
+def test_a_film_behind_a_jpeg_does_no_harm_and_cmyk_keeps_its_colours(tmp_path: Path) -> None:
     """As phones append it."""
     (tmp_path / "image.jpg").write_bytes(JPEGS["baseline"] + b"ftyp" * 50)
     np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg")[..., ::-1], cv2.imread(str(tmp_path / "image.jpg")))
-
-
-def test_cmyk_is_near_to_the_colours_that_were_saved(tmp_path: Path) -> None:
     (tmp_path / "image.jpg").write_bytes(save("CMYK", "JPEG", quality=98))
     difference = read_rgb(tmp_path / "image.jpg").astype(int) - smooth_picture()
     assert np.abs(difference).mean() < 3
@@ -172,14 +169,9 @@ def test_colours_are_written_as_rgb(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "image.png"))[1, 1].tolist() == [0, 100, 200]  # OpenCV reads BGR
 
 
-@pytest.mark.parametrize("file", ["a.jpg", "./a/../b.jpg", "more/a..b.jpg"])
-def test_sound_file_names(file: str) -> None:
-    assert file_name_problem(file) is None
-
-
-@pytest.mark.parametrize("file", ["../a.jpg", "a/../../b.jpg", "/a.jpg", "", ".", "a\0.jpg"])
-def test_file_names_that_lead_out_or_nowhere(file: str) -> None:
-    assert file_name_problem(file)
+def test_file_names_that_lead_out_or_nowhere() -> None:
+    assert all(map(file_name_problem, ["../a.jpg", "a/../../b.jpg", "/a.jpg", "", ".", "a\0.jpg"]))
+    assert not any(map(file_name_problem, ["a.jpg", "./a/../b.jpg", "more/a..b.jpg"]))
 
 
 @pytest.mark.parametrize("file", ["../a.jpg", "/a.jpg", "C:/a.jpg", "C:a.jpg", "\\\\server\\share\\a.jpg"])
@@ -219,7 +211,7 @@ def test_a_bomb_is_never_decoded(bomb: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(PngImageFile, "load", refuse)
     with pytest.raises(InputError, match="it is 32000 x 32000 pixels, expected at most 268435456"):
         read_image(bomb)
-    with pytest.raises(image_file.WrongSize, match="it is 32000 x 32000"):
+    with pytest.raises(image_file.WrongSize, match="32000 x 32000, its camera says 640 x 480"):
         read_image(bomb, (640, 480))
     path = bomb.with_name("deep.png")
     data = bomb.read_bytes()

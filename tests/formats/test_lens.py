@@ -166,18 +166,16 @@ def test_beyond_90_degrees_a_fisheye_gets_no_labels() -> None:
     lens, matrix = fisheye_lens(focal=40.0)
     angle = np.linalg.norm(centers() - matrix[:2, 2], axis=1).reshape(HEIGHT, WIDTH) / 40  # about, without k1 to k4
     labels = distort(np.full((HEIGHT, WIDTH), 7, np.uint16), lens, matrix)
+    assert opencv_distortion(lens) is None
     assert angle.max() > 2
     assert (labels[angle > 1.7] == 0).all()
     assert (labels[angle < 0.8] == 7).all()
 
 
-def test_without_lens_the_image_stays() -> None:
+def test_without_lens_the_image_stays_and_lenses_in_turn_do_not_disturb_each_other() -> None:
     labels = paint_blobs(centers())
     assert undistort(labels, None, K) is labels
     assert distort(labels, None, K) is labels
-
-
-def test_lenses_in_turn_do_not_disturb_each_other() -> None:
     labels = paint_blobs(centers())
     first = {name: undistort(labels, lens_of(values), K) for name, values in COEFFICIENTS.items()}
     for name, values in COEFFICIENTS.items():
@@ -204,11 +202,6 @@ def test_lenses_of_colmap_are_opencvs(model: str, params: list[float]) -> None:
     rays = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2))
     rays = np.column_stack([rays, np.ones(20)])
     np.testing.assert_allclose(same.img_from_cam(rays), lens.img_from_cam(rays), atol=1e-9)
-
-
-def test_a_fisheye_is_none_of_opencvs() -> None:
-    lens = pycolmap.Camera(model="OPENCV_FISHEYE", width=WIDTH, height=HEIGHT, params=[150, 155, 80, 60, *FISHEYE])
-    assert opencv_distortion(lens) is None
 
 
 def test_positions_are_computed_part_by_part(monkeypatch: pytest.MonkeyPatch) -> None:

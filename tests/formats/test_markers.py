@@ -63,7 +63,7 @@ def test_neither_blur_nor_a_tone_curve_changes_the_size_of_a_marker(
     assert np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1) == pytest.approx(side, rel=0.004)
 
 
-def test_a_marker_that_is_there_twice_says_nothing() -> None:
+def test_a_marker_that_is_there_twice_and_no_marker_say_nothing() -> None:
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
     photo = np.full((120, 300), 255, np.uint8)
     for number, left in ((3, 20), (3, 110), (5, 200)):
@@ -71,9 +71,6 @@ def test_a_marker_that_is_there_twice_says_nothing() -> None:
     found = find_markers(photo, "4X4_1000")
     assert list(found) == [5]
     np.testing.assert_allclose(found[5], [[200, 20], [280, 20], [280, 100], [200, 100]], atol=0.3)  # edges of pixels
-
-
-def test_nothing_to_see() -> None:
     numbers, px = find_board(np.full((80, 80), 128, np.uint8), BOARD)
     assert (numbers.shape, px.shape) == ((0,), (0, 2))
     assert find_markers(np.full((80, 80), 128, np.uint8), "5X5_1000") == {}

@@ -108,12 +108,9 @@ def test_too_few_views(count: int, message: str) -> None:
         scene_of(*[make_photo("images/a.jpg")] * count)
 
 
-def test_two_photos_of_one_view_name() -> None:
+def test_photos_that_do_not_fit_their_cameras(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"plant/cameras.json: views 0 and 2 have the same name 'a'"):
         scene_of(make_photo("images/a.jpg"), make_photo("images/b.jpg", 1), make_photo("images/a.png", 2))
-
-
-def test_a_photo_of_another_size_than_its_camera_says(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant", 2)
     write_image(folder / "images" / "001.png", np.zeros((HEIGHT, WIDTH + 1, 3), np.uint8))
     with pytest.raises(InputError, match=r"001\.png: the image of view 1 is 129 x 96, its camera says 128 x 96"):

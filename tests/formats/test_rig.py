@@ -60,21 +60,15 @@ def test_round_trip(tmp_path: Path) -> None:
     assert list(again.views[1].lens.params) == list(scene.views[1].lens.params)  # type: ignore[union-attr]
 
 
-def test_zero_distortion_is_none(tmp_path: Path) -> None:
+def test_zero_distortion_no_unit_and_a_byte_order_mark_are_no_faults(tmp_path: Path) -> None:
     rig = rig_content()
     rig["views"][0]["distortion"] = [0, 0, 0, 0, 0]
     rig["views"][1]["distortion"] = []
     rig["views"][2]["distortion"] = None
     assert all(view.lens is None for view in read(tmp_path, rig).views)
-
-
-def test_unit_may_be_left_out(tmp_path: Path) -> None:
     rig = rig_content()
     del rig["unit"]
     assert read(tmp_path, rig).unit == ""
-
-
-def test_a_byte_order_mark_is_no_fault(tmp_path: Path) -> None:
     (tmp_path / "cameras.json").write_text(json.dumps(rig_content()), encoding="utf-8-sig")
     assert len(read_rig(tmp_path / "cameras.json").views) == 4
 

@@ -101,16 +101,6 @@ def test_label_pngs_become_regions(tmp_path: Path) -> None:
         np.testing.assert_array_equal(regions.mask(index, WIDTH, HEIGHT), painted)
 
 
-def test_coco_masks_are_the_same_regions(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "plant")
-    write_coco_masks(folder, folder / "masks.json")
-    scene = load_scene(folder)
-    png, coco = load_masks(scene, folder / "masks"), load_masks(scene, folder / "masks.json")
-    for field in ("view_index", "boxes", "crops"):
-        assert torch.equal(getattr(png, field), getattr(coco, field))
-    assert coco.labels.tolist() == list(range(1, 13))
-
-
 @pytest.mark.parametrize("kind", ["png", "coco"])
 def test_masks_of_distorted_photos_are_undistorted(kind: str, tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")

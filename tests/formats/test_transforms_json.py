@@ -77,7 +77,7 @@ def test_three_rows_are_as_good_as_four(tmp_path: Path) -> None:
     assert torch.equal(read(tmp_path, content).cameras.t, whole.t)
 
 
-def test_intrinsics_of_a_frame_go_first(tmp_path: Path) -> None:
+def test_intrinsics_of_frames_go_first_and_one_focal_length_serves_both_axes(tmp_path: Path) -> None:
     content = transforms()
     content["frames"][1] |= {"fl_x": 99.0, "fl_y": 98.0, "w": 220, "k1": 0.1}
     cameras = (scene := read(tmp_path, content)).cameras
@@ -86,17 +86,11 @@ def test_intrinsics_of_a_frame_go_first(tmp_path: Path) -> None:
     assert cameras.K[1, :2, 2].tolist() == [101, 61]
     assert cameras.sizes.tolist() == [[200, 120], [220, 120], [200, 120]]
     assert [view.lens is None for view in scene.views] == [True, False, True]
-
-
-def test_all_intrinsics_in_frames(tmp_path: Path) -> None:
     content = transforms()
     content["frames"] = [frame | INTRINSICS for frame in content["frames"]]
     for key in INTRINSICS:
         del content[key]
     assert read(tmp_path, content).cameras.K[2, 1, 1] == 160
-
-
-def test_one_focal_length_serves_both_axes(tmp_path: Path) -> None:
     content = transforms()
     del content["fl_y"]
     assert read(tmp_path, content).cameras.K[0].diagonal().tolist() == [150, 150, 1]
@@ -185,7 +179,7 @@ def test_instant_ngps_fisheye_is_opencvs(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("key", ["ftheta_p0", "latlong", "equirectangular"])
 def test_other_lenses_of_instant_ngp_are_refused(key: str, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=f"transforms.json: the lens is of instant-ngp's kind '{key}'"):
+    with pytest.raises(InputError, match=f"transforms.json: '{key}' of the file is 1.5, which is not supported"):
         read(tmp_path, transforms() | {key: 1.5})
 
 

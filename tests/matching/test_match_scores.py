@@ -15,11 +15,8 @@ def evidence(**changes: float) -> IdEvidence:
     return IdEvidence(**{name: np.array([value]) for name, value in plain.items()}, num_views=5)
 
 
-def test_a_plain_match_is_nearly_certain() -> None:
+def test_a_plain_match_is_nearly_certain_and_alone_is_zero() -> None:
     assert 0.97 < match_scores(evidence())[0] < 1
-
-
-def test_alone_is_zero() -> None:
     assert match_scores(evidence(num_partners=0))[0] == 0
 
 
@@ -50,15 +47,9 @@ def test_a_region_is_believed_less_among_unsure_ones() -> None:
     doubtful = [evidence(score=0.1, margin=0.0, weight=0.4)] * 3
     among_sure, among_doubtful = (match_scores(join(evidence(), *others))[0] for others in ([evidence()], doubtful))
     assert among_doubtful < among_sure - 0.1
-
-
-def test_regions_that_are_alone_say_nothing_about_the_scene() -> None:
     alone = evidence(num_partners=0, agreement=0.0, score=0.0, margin=-1.0)
     assert match_scores(join(evidence(), alone)).tolist() == pytest.approx([match_scores(evidence())[0], 0])
     assert match_scores(join(alone, alone)).tolist() == [0, 0]
-
-
-def test_another_answer_from_the_weights_alone_means_doubt() -> None:
     assert match_scores(evidence(agreement=0.4))[0] < match_scores(evidence())[0] - 0.02
 
 

@@ -18,14 +18,7 @@ from mvseg.matching.numbers import COSTS, EM, NVIEW, SWEEP
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.initialisation import em_affinities
 from mvseg.matching.nview.match_nview import match_nview
-from mvseg.matching.nview.plane_sweep import (
-    EMPTY,
-    OUTSIDE,
-    PlaneSweep,
-    rays_per_region,
-    sweep_dilated,
-    sweep_planes,
-)
+from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import refine_clusters, search
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.partition import Clusters
@@ -98,9 +91,6 @@ def test_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScor
             for cluster in range(len(clusters)):
                 members = set(np.flatnonzero((clusters.ids == cluster) & (sweep.view_index != view)).tolist())
                 assert view_scores[row, cluster] == pytest.approx(score_reference(sweep, region, members), abs=1e-5)
-
-
-def test_own_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
     clusters = some_clusters(sweep, 1)
     own_scores, ids = scores.own(clusters), clusters.ids
     for region in range(0, len(ids), 3):
@@ -240,7 +230,7 @@ def labels_of(regions: Regions) -> tuple[list[int], list[int]]:
     return regions.view_index.tolist(), regions.labels.tolist()
 
 
-def test_the_world_may_be_moved_turned_and_scaled() -> None:
+def test_the_world_may_be_moved_turned_and_scaled_and_photos_be_larger() -> None:
     scene = ball_scene(10, 4, seed=5)
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)).double())[0]
     rotation = rotation * torch.linalg.det(rotation).sign()
@@ -248,9 +238,6 @@ def test_the_world_may_be_moved_turned_and_scaled() -> None:
     matching = solve(scene.regions, moved(scene.cameras, 250.0, rotation, torch.tensor([9.0, -4.0, 70.0]).double()))
     assert same_partition(matching.instance_ids, expected.instance_ids)
     torch.testing.assert_close(matching.match_scores, expected.match_scores, atol=0.02, rtol=0)
-
-
-def test_twice_the_resolution() -> None:
     scene = ball_scene(10, 5, seed=6)
     big = ball_scene(10, 5, seed=6, focal=800.0, width=640, height=480)
     matching, expected = solve(big.regions, big.cameras), solve(scene.regions, scene.cameras)
@@ -331,13 +318,8 @@ def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> Non
     scene = ball_scene(3, 4, seed=2)
     monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, rays=4))
     sweep = sweep_planes(scene.regions, scene.cameras)
-    expected = soft_affinity_reference(
-        sweep.labels.tolist(),
-        sweep.pixel.tolist(),
-        sweep.pixel_region.tolist(),
-        num_regions=len(sweep.view_index),
-        sharpness=[8.0, 12.0],
-    )
+    lists = (each.tolist() for each in (sweep.labels, sweep.pixel, sweep.pixel_region))
+    expected = soft_affinity_reference(*lists, num_regions=len(sweep.view_index), sharpness=[8.0, 12.0])
     np.testing.assert_allclose(em_affinities(sweep)[1], expected, atol=2e-4)
 
 
@@ -386,14 +368,11 @@ def test_nothing_to_match() -> None:
     assert matching.instance_ids.tolist() == [-1]
 
 
-def test_wrong_poses_are_noticed() -> None:
+def test_pose_errors_are_noticed_measured_and_tolerated() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.25)
     matching = solve(scene.regions, turned_a_little(scene.cameras, 0.004))
     assert same_partition(matching.instance_ids, scene.regions.labels)
     assert matching.report.explained < solve(scene.regions, scene.cameras).report.explained
-
-
-def test_large_pose_errors_are_measured_and_tolerated() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     matching = solve(scene.regions, turned_a_little(scene.cameras, 0.008))
     assert matching.report.residual_px > 1
@@ -414,7 +393,7 @@ def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatc
         match_regions(scene.regions, cameras, residual_px=3)
 
 
-@pytest.mark.parametrize("angle", [0.004, 0.008, 0.02])
+@pytest.mark.parametrize("angle", [0.004, 0.02])
 def test_a_few_rays_tell_the_reprojection_error(angle: float, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, angle)
@@ -454,10 +433,5 @@ def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypat
 def turned_a_little(cameras: Cameras, radians: float) -> Cameras:
     """Cameras whose orientation is off by about `radians`."""
     noise = radians * torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(3)).double()
-    turn = torch.linalg.matrix_exp(torch.stack([skew(axis) for axis in noise]))
+    turn = torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).double()[None], noise[:, None], dim=2))
     return Cameras(cameras.K, turn @ cameras.R, (turn @ cameras.t[:, :, None])[:, :, 0], cameras.sizes)
-
-
-def skew(axis: torch.Tensor) -> torch.Tensor:
-    x, y, z = axis.tolist()
-    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]).double()

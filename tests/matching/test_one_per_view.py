@@ -8,12 +8,7 @@ import torch
 
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.one_per_view import (
-    assign_one_to_one,
-    join_alone,
-    link_average,
-    one_per_view_clusters,
-)
+from mvseg.matching.one_per_view import assign_one_to_one, join_alone, link_average, one_per_view_clusters
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions
@@ -34,25 +29,6 @@ def random_weights(views: np.ndarray, seed: int) -> np.ndarray:
     return W
 
 
-def mean_weights_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.ndarray:
-    """Average linkage from its definition: every mean computed afresh from all pairs."""
-    clusters = [[n] for n in range(len(W))]
-    while True:
-        options = [
-            (float(np.mean([W[n, m] for n in a for m in b])), a, b)
-            for a, b in itertools.combinations(clusters, 2)
-            if not {views[n] for n in a} & {views[m] for m in b}
-        ]
-        best = max(options, key=lambda option: option[0], default=(0.0, [], []))
-        if best[0] < stop or best[0] <= 0:
-            break
-        clusters = [c for c in clusters if c is not best[1] and c is not best[2]] + [best[1] + best[2]]
-    ids = np.empty(len(W), np.int64)
-    for index, cluster in enumerate(clusters):
-        ids[cluster] = index
-    return ids
-
-
 def test_the_whole_view_decides_not_the_single_best_edge() -> None:
     """Agglomeration would take 0.9 first and leave a pair of 0.1; the assignment finds 0.8 + 0.8."""
     W = np.zeros((4, 4))
@@ -70,7 +46,6 @@ def test_average_linkage_agrees_with_its_definition(seed: int, stop: float) -> N
     W = random_weights(views, seed)
     linked = link_average(ViewGraph(W, views, 4), stop).ids
     np.testing.assert_array_equal(linked, Clusters.of(link_average_reference(W, views, stop)).ids)
-    np.testing.assert_array_equal(linked, Clusters.of(mean_weights_reference(W, views, stop)).ids)
 
 
 def test_of_equal_weights_the_first_regions_win() -> None:
@@ -96,24 +71,18 @@ def test_assignment_agrees_with_trying_everything() -> None:
         assert len(set(chosen.tolist())) == 3
 
 
-def test_never_two_regions_of_one_view() -> None:
+def test_never_two_regions_of_one_view_and_a_second_chance_for_those_alone() -> None:
     for seed in range(5):
         views = np.random.default_rng(seed).integers(0, 5, 40)
         W = random_weights(views, seed)
         pairs = [(i, v) for i, v in zip(ids_of(W, views.tolist()), views, strict=True) if i > 0]
         assert len(pairs) == len(set(pairs))
-
-
-def test_second_chance_for_those_alone() -> None:
-    """Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is in a taken view; 4 and 5 only fit each other; 6 nothing."""
+    # Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is in a taken view; 4 and 5 only fit each other; 6 nothing.
     views, W = np.array([0, 1, 2, 0, 1, 2, 3]), np.zeros((7, 7))
     W[0, 1], W[0, 2], W[1, 2], W[1, 3], W[4, 5], W[6, 0] = 0.9, 0.8, 0.6, 0.9, 0.5, 0.3
     joined = join_alone(ViewGraph(W + W.T, views, 4), Clusters.of(np.array([0, 0, 1, 2, 3, 4, 5])), stop=0.4)
     assert joined.ids.tolist() == [0, 0, 0, 1, 2, 2, 3]
-
-
-def test_of_two_alone_in_one_view_the_one_with_the_largest_weight_to_anybody_comes_first() -> None:
-    """Cluster 0 holds views 0 and 1; regions 2 and 3, of one view, both fit it, and only one can join."""
+    # Cluster 0 holds views 0 and 1; regions 2 and 3, of one view, both fit it, and only one can join.
     views, W = np.array([0, 1, 2, 2]), np.zeros((4, 4))
     W[0, 1], W[0, 2], W[1, 2], W[0, 3], W[1, 3] = 0.9, 0.6, 0.6, 0.9, 0.5
     joined = join_alone(ViewGraph(W + W.T, views, 3), Clusters.of(np.array([0, 0, 1, 2])), stop=0.4)
@@ -130,8 +99,5 @@ def test_balls_are_solved_in_any_order() -> None:
     assert matching_metrics(ids, scene.regions.labels).ari == 1
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(0))
     assert matching_metrics(ids_of_regions(scene.regions.select(order)), ids[order]).ari == 1
-
-
-def test_no_edges_and_no_regions() -> None:
     assert ids_of(np.zeros((2, 2)), [0, 1]) == [-1, -1]
     assert ids_of(np.zeros((0, 0)), []) == []

@@ -18,14 +18,11 @@ def test_clusters_are_numbered_from_0_and_instances_from_1_by_their_first_member
     assert clusters.is_alone.tolist() == [False, False, False, True, True, False, True]
 
 
-def test_nothing_is_a_partition_too() -> None:
+def test_numbering_is_idempotent_and_keeps_the_partition() -> None:
     assert Clusters.of(np.array([-1, -1])).ids.tolist() == [-1, -1]
     none = Clusters.of(np.zeros(0, np.int64))
     assert (none.ids.tolist(), len(none), none.members, none.is_alone.tolist()) == ([], 0, [], [])
     assert none.instance_ids().tolist() == none.drop_singletons().ids.tolist() == []
-
-
-def test_numbering_is_idempotent_and_keeps_the_partition() -> None:
     numbers = np.random.default_rng(0).integers(-1, 9, 50)
     once = Clusters.of(numbers).ids
     np.testing.assert_array_equal(Clusters.of(once).ids, once)
@@ -37,9 +34,6 @@ def test_members_are_those_of_the_definition() -> None:
     members = members_of(np.array([2, -1, 0, 2]), 4)
     assert [each.tolist() for each in members] == [[2], [], [0, 3], []]
     assert members_of(np.zeros(0, np.int64), 0) == []
-
-
-def test_regions_alone_are_unmatched_and_back() -> None:
     dropped = Clusters.of(np.array([0, 1, 0, 2])).drop_singletons()
     assert dropped.ids.tolist() == [0, -1, 0, -1]
     apart = separate_unmatched(dropped.ids)

@@ -11,7 +11,7 @@ from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
 from synthetic import ball_scene
 
-STEP = 13  # every so many masks, each of another leaf and view; all 108 take a minute
+STEP = 25  # every so many masks, each of another leaf and view; all 108 take a minute
 
 
 def test_a_leaf_that_one_photo_shows_joins_no_other(

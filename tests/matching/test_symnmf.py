@@ -30,7 +30,7 @@ def test_finds_the_blocks_and_their_number() -> None:
     assert clustering.criterion[6] == 0
 
 
-def test_given_k_and_given_range() -> None:
+def test_given_k_and_given_range_decide() -> None:
     affinity, truth = block_graph([4, 4, 4])
     given = cluster_affinity(affinity, torch.tensor([9]), num_instances=3)
     assert list(given.criterion) == [3]
@@ -38,10 +38,7 @@ def test_given_k_and_given_range() -> None:
     ranged = cluster_affinity(affinity, torch.tensor([9]), search_range=(2, 4))
     assert sorted(ranged.criterion) == [2, 3, 4]
     assert ranged.num_clusters == 3
-
-
-def test_the_search_range_decides() -> None:
-    """Eq. 7 is 0 for k = 1 as for the true k: a range that starts at 1 finds one instance."""
+    # Eq. 7 is 0 for k = 1 as for the true k: a range that starts at 1 finds one instance.
     affinity, _ = block_graph([4, 4, 4])
     assert cluster_affinity(affinity, torch.tensor([3]), search_range=(1, 6)).num_clusters == 1
 
@@ -52,9 +49,6 @@ def test_regions_without_an_edge_are_unmatched() -> None:
     clustering = cluster_affinity(wider, torch.tensor([4, 4]), num_instances=2)
     assert clustering.instance_ids[-2:].tolist() == [-1, -1]
     assert matching_metrics(clustering.instance_ids[:-2], truth).ari == 1
-
-
-def test_no_edges_no_clusters() -> None:
     none = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 3)
     clustering = cluster_affinity(none, torch.tensor([2, 1]))
     assert clustering.instance_ids.tolist() == [-1, -1, -1]
@@ -76,9 +70,6 @@ def test_factorise_agrees_with_the_element_wise_update() -> None:
     expected = factorise_reference(W.numpy().astype(np.float64), start.T.numpy().astype(np.float64), 30)
     (H,) = factorise(W, [k], num_restarts=1, num_iterations=30, seed=seed)
     np.testing.assert_allclose(H.numpy(), expected, rtol=2e-3, atol=1e-5)
-
-
-def test_factorising_several_k_at_once_changes_none() -> None:
     W = block_graph([3, 4, 3, 5], noise=0.4)[0].to_dense()
     together = factorise(W, [2, 4, 7], seed=1)
     for k, H in zip([2, 4, 7], together, strict=True):

@@ -42,6 +42,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
         steps = watch_stages(patch)
         structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
         scene = write_structure(structure, folder)
-        patch.setattr(markers, "FAMILIES", ("4X4_1000", BOARD.family))  # to look for all of them takes seconds
+        patch.setattr(markers, "FAMILIES", (BOARD.family,))  # to look for all of them takes seconds
         seen = find_scene_markers(Photos(scene))
     return MappedRoom(folder, tuple(steps), truth, files, structure, scene, seen)

@@ -47,13 +47,10 @@ def test_a_board_gives_scale_and_axes(room) -> None:
     assert f"scale from {placement.source}, residual 0." in placement.describe()
 
 
-def test_markers_of_a_known_size_give_the_scale(room) -> None:
+def test_markers_and_distances_of_a_known_size_give_the_scale(room) -> None:
     placement = place(room.scene, WorldFacts(marker=BOARD.marker, unit="mm"))
     assert placement.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
     assert int(placement.source.split()[0]) >= 8
-
-
-def test_the_distance_of_two_markers_or_photos_gives_the_scale(room) -> None:
     markers = place(room.scene, WorldFacts(distance=("marker:0", "marker:1", 2 * BOARD.square)))  # in one row
     assert markers.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
     centers = room.truth.centers.numpy()
@@ -159,9 +156,6 @@ def test_positions_of_nothing(room, tmp_path: Path) -> None:
     path = write_positions(tmp_path / "log.csv", np.eye(3), ["a.png", "b.png", "c.png"])
     with pytest.raises(InputError, match=r"0 of its photos are registered \(a.png, b.png, c.png\)"):
         place(room.scene, WorldFacts(positions=path))
-
-
-def test_nothing_known_leaves_the_scene_as_it_is(room) -> None:
     placement = place(room.scene, WorldFacts())
     np.testing.assert_array_equal(placement.similarity.matrix(), np.eye(4)[:3])
     assert "arbitrary units" in placement.describe()

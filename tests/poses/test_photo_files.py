@@ -38,9 +38,6 @@ def test_photos_are_listed_as_people_count(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("")
     assert list_photos(tmp_path) == (tmp_path, ["9.jpg", "10.JPG", "img1.png"])
     assert sorted(["b10", "b9", "a2b", "a2", "a10"], key=natural_order) == ["a2", "a2b", "a10", "b9", "b10"]
-
-
-def test_photos_lie_in_images_or_in_a_folder_per_camera(tmp_path: Path) -> None:
     save(tmp_path / "scene", "images/0.png", "images/1.png", "images/2.png", "masks/0.png")
     assert list_photos(tmp_path / "scene") == (tmp_path / "scene" / "images", ["0.png", "1.png", "2.png"])
     save(tmp_path / "rig", "top/0.png", "top/1.png", "side/0.png", "side/1.png")

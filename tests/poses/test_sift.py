@@ -38,14 +38,11 @@ def test_pixels_are_of_the_photo_whatever_the_size() -> None:
 
 def test_descriptors_have_one_length_and_no_more_are_kept_than_asked_for() -> None:
     sift = find_sift(rgb(), image_size=1000, most=200)
-    assert len(sift) == 200
+    assert len(sift.px) == 200
     assert sift.descriptors.dtype == np.uint8
     np.testing.assert_allclose(np.linalg.norm(sift.descriptors.astype(float), axis=1), STRUCTURE.unit, rtol=0.02)
-
-
-def test_a_photo_without_texture() -> None:
     sift = find_sift(np.full((60, 80, 3), 120, np.uint8), image_size=1000, most=100)
-    assert (len(sift), sift.px.shape, sift.descriptors.shape) == (0, (0, 2), (0, 128))
+    assert (len(sift.px), sift.px.shape, sift.descriptors.shape) == (0, (0, 2), (0, 128))
     assert count_alike([coarsest(sift), coarsest(find_sift(rgb(), image_size=500, most=100))]).tolist() == [[0, 0]] * 2
 
 

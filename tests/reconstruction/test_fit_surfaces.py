@@ -40,15 +40,12 @@ def bent() -> LeafSurface:
     return fit(blade_masks(BENT, CAMERAS))
 
 
-def test_flat_ellipse_has_its_area_length_and_width() -> None:
+def test_flat_and_bent_blades_have_their_areas_lengths_and_widths(bent: LeafSurface) -> None:
     surface = fit(blade_masks(FLAT, CAMERAS))
     assert np.abs(errors(surface, FLAT)).max() < 0.012
     assert abs(float(surface.normal[2])) > 0.999
-    assert surface.quality.is_good
+    assert not surface.reasons
     assert float(surface.points()[..., 2].abs().max()) < 0.03
-
-
-def test_bent_blade_has_its_area_length_and_width(bent: LeafSurface) -> None:
     assert np.abs(errors(bent, BENT)).max() < 0.015
     middle = bent.midrib[len(bent.midrib) // 2]
     drop = BENT.bend * (np.cos(1 / BENT.bend) - 1)
@@ -74,21 +71,15 @@ def test_surface_covers_the_masks_that_it_was_fitted_to(bent: LeafSurface) -> No
     assert float(bent.residual_px.max()) < 0.4
 
 
-def test_order_of_the_views_does_not_matter(bent: LeafSurface) -> None:
-    order = [3, 7, 0, 9, 1, 8, 2, 6, 4, 5]
-    masks = blade_masks(BENT, CAMERAS)
-    other = fit([masks[view] for view in order], CAMERAS[order])
-    assert other.area == pytest.approx(bent.area, rel=2e-3)
-    assert other.length == pytest.approx(bent.length, rel=2e-3)
-
-
-def test_world_may_be_moved_turned_and_scaled(bent: LeafSurface) -> None:
+def test_order_of_the_views_does_not_matter_and_the_world_may_be_moved_turned_and_scaled(bent: LeafSurface) -> None:
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     turn = torch.from_numpy(turn * np.sign(np.linalg.det(turn)))
     scale, shift = 250.0, torch.tensor([4000.0, -300.0, 80.0], dtype=torch.float64)
     R = CAMERAS.R @ turn.T
     t = scale * CAMERAS.t - R @ shift
-    other = fit(blade_masks(BENT, CAMERAS), Cameras(K=CAMERAS.K, R=R, t=t, sizes=CAMERAS.sizes))
+    order, masks = [3, 7, 0, 9, 1, 8, 2, 6, 4, 5], blade_masks(BENT, CAMERAS)
+    moved = Cameras(K=CAMERAS.K, R=R, t=t, sizes=CAMERAS.sizes)
+    other = fit([masks[view] for view in order], moved[order])
     assert other.area / scale**2 == pytest.approx(bent.area, rel=5e-3)
     assert other.length / scale == pytest.approx(bent.length, rel=5e-3)
     assert other.width / scale == pytest.approx(bent.width, rel=5e-3)
@@ -167,10 +158,10 @@ class Rectangle(EllipticBlade):
 def test_shapes_that_no_patch_has() -> None:
     """The bays of a star are no part of its area; where a rectangle ends is doubted."""
     star = fit(blade_masks(Star(), CAMERAS))
-    assert star.quality.is_good
+    assert not star.reasons
     assert star.area == pytest.approx(2.2584, rel=0.02)  # the integral of r^2 / 2
     assert star.mesh().area == pytest.approx(star.area, rel=0.03)
-    assert [*fit(blade_masks(Rectangle(), CAMERAS)).quality.reasons] == ["blunt_end"]
+    assert [*fit(blade_masks(Rectangle(), CAMERAS)).reasons] == ["blunt_end"]
 
 
 def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:
@@ -180,35 +171,32 @@ def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:
     masks = [mask & blade for mask, blade in zip(masks, blade_masks(FLAT, CAMERAS), strict=True)]
     surface = fit(masks)
     assert not surface.is_credible
-    assert not surface.quality.is_good
+    assert surface.reasons
 
 
-def half_hidden(label: int) -> list[np.ndarray]:
+def half_hidden() -> list[np.ndarray]:
     """Label maps in which something hides one half of the blade in four of ten views."""
     maps = [mask.astype(np.int64) for mask in blade_masks(BENT, CAMERAS)]
     for view in (0, 3, 5, 8):
         columns = np.flatnonzero(maps[view].any(0))
         hidden = np.zeros((SIZE, SIZE), bool)
         hidden[:, int(columns.mean()) :] = True
-        maps[view][hidden] = label
+        maps[view][hidden] = 2
     return maps
 
 
-def test_another_instance_may_hide_half_of_the_leaf() -> None:
-    assert np.abs(errors(fit(half_hidden(2)), BENT)).max() < 0.03
-
-
-def test_regions_matched_to_nothing_hide_leaves_too() -> None:
-    regions, ids = as_regions(half_hidden(2))
-    surface = fit_surfaces(regions, torch.where(ids == 2, -1, ids), CAMERAS)[1]
+@pytest.mark.parametrize("hides", [2, -1])
+def test_another_instance_or_a_mask_matched_to_nothing_may_hide_half_of_the_leaf(hides: int) -> None:
+    regions, ids = as_regions(half_hidden())
+    surface = fit_surfaces(regions, torch.where(ids == 2, hides, ids), CAMERAS)[1]
     assert np.abs(errors(surface, BENT)).max() < 0.03
 
 
 def test_two_views_say_so() -> None:
     masks = blade_masks(BENT, CAMERAS)
     surface = fit([masks[0], masks[2]], CAMERAS[[0, 2]])
-    assert not surface.quality.is_good
-    assert "two_views" in surface.quality.reasons
+    assert surface.reasons
+    assert "two_views" in surface.reasons
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.37, 1 / 3, 1e3])
@@ -222,25 +210,21 @@ def test_starts_do_not_depend_on_the_size_of_a_voxel(size: float) -> None:
     assert scaled / size == pytest.approx(starts, rel=1e-9, abs=1e-9)
 
 
-def test_one_view_gives_no_numbers() -> None:
+def test_one_view_or_no_common_point_gives_no_surface() -> None:
     masks = blade_masks(BENT, CAMERAS)
     surface = fit([masks[0], np.zeros_like(masks[0])], CAMERAS[[0, 2]])
-    assert surface.quality.reasons == {"one_view": "seen in one view only"}
+    assert surface.reasons == {"one_view": "seen in one view only"}
     assert not surface.exists
     assert np.isnan([surface.area, surface.length, surface.width, *surface.deviations]).all()
     assert len(surface.mesh().faces) == 0
     assert not any(mask.any() for mask in surface.project(CAMERAS))
-
-
-def test_masks_without_a_common_point_give_no_surface() -> None:
     masks = [np.zeros((SIZE, SIZE), bool) for _ in range(2)]
     masks[0][:20, :20], masks[1][-20:, -20:] = True, True
     surface = fit(masks, CAMERAS[[0, 1]])
-    assert [*surface.quality.reasons] == ["no_common_point"]
+    assert [*surface.reasons] == ["no_common_point"]
 
 
-@pytest.mark.parametrize("num_views", [3, 6])
-@pytest.mark.parametrize("kind", ["line", "level line", "ring", "salt"])
+@pytest.mark.parametrize(("kind", "num_views"), [("line", 3), ("line", 6), ("level line", 3), ("ring", 6), ("salt", 3)])
 def test_masks_of_a_pixel_give_no_surface_that_is_trusted(kind: str, num_views: int) -> None:
     """Their hulls are flat, or of a few voxels: no start of such a one may divide by its width or length."""
     cameras, rng = ring_cameras(num_views), np.random.default_rng(0)
@@ -255,7 +239,7 @@ def test_masks_of_a_pixel_give_no_surface_that_is_trusted(kind: str, num_views: 
             cv2.line(mask, (x, y), (end[0], y) if kind == "level line" else tuple(end), 1)
     surface = fit(list(masks), cameras)
     assert not surface.is_credible
-    assert not surface.quality.is_good
+    assert surface.reasons
 
 
 def test_a_start_that_no_mask_is_near_gives_no_surface() -> None:
@@ -265,24 +249,20 @@ def test_a_start_that_no_mask_is_near_gives_no_surface() -> None:
     surface = fit_surfaces(regions, ids, CAMERAS[:4], starts={1: far})[1]
     assert not surface.exists
     assert not surface.is_credible
-    assert [*surface.quality.reasons] == ["shape_unknown"]
+    assert [*surface.reasons] == ["shape_unknown"]
 
 
 def test_no_regions_give_no_surfaces() -> None:
     regions, ids = as_regions([np.zeros((SIZE, SIZE), bool)] * 2)
     assert fit_surfaces(regions, ids, CAMERAS[[0, 1]]) == {}
-
-
-def test_as_many_ids_as_regions() -> None:
     regions, ids = as_regions(blade_masks(FLAT, CAMERAS))
     with pytest.raises(InputError, match="9 instance ids for 10 regions"):
         fit_surfaces(regions, ids[:9], CAMERAS)
 
 
-@pytest.mark.parametrize(("elevation_deg", "arc_deg"), [(60, 360), (45, 144)])
-def test_cameras_that_all_look_down_show_a_level_leaf(elevation_deg: float, arc_deg: float) -> None:
+def test_cameras_that_all_look_down_show_a_level_leaf() -> None:
     """Its hull is as thick as it is wide: only the fit tells that the leaf does not stand upright."""
-    cameras = ring_cameras(8, elevations_deg=(elevation_deg,), arc_deg=arc_deg)
+    cameras = ring_cameras(8, elevations_deg=(45,), arc_deg=144)
     surface = fit(blade_masks(FLAT, cameras), cameras)
     assert abs(float(surface.normal[2])) > 0.99
     assert np.abs(errors(surface, FLAT)).max() < 0.02
@@ -304,4 +284,4 @@ def test_leaves_that_are_searched_side_by_side_are_those_of_each_alone(
     for instance, alone in fit_surfaces(regions, ids, cameras, is_rough=is_rough).items():
         assert torch.equal(together[instance].coefficients, alone.coefficients)
         assert torch.equal(together[instance].covariance, alone.covariance)
-        assert together[instance].quality == alone.quality
+        assert together[instance].reasons == alone.reasons

@@ -56,10 +56,8 @@ def test_deviations_of_a_linear_measure_are_exact_in_any_unit(factor: float) -> 
 
 def test_numbers_that_are_none_have_no_deviation() -> None:
     surface = bent_blade()
-    assert np.isfinite(surface.deviation(lambda c: np.stack([c[:, 0, 0], np.full(len(c), np.nan)], 1))).tolist() == [
-        True,
-        False,
-    ]
+    sds = surface.deviation(lambda c: np.stack([c[:, 0, 0], np.full(len(c), np.nan)], 1))
+    assert np.isfinite(sds).tolist() == [True, False]
     nothing = LeafSurface.none(torch.tensor([0]), "test", "seen in one view only")
     assert not nothing.is_credible
     assert surface.is_credible

@@ -21,9 +21,6 @@ def deviation(offsets: list[np.ndarray]) -> tuple[float, float]:
 def test_errors_that_end_sharply_are_centred_by_their_extremes() -> None:
     learned, plain = deviation(FLAT)
     assert learned < 0.5 * plain
-
-
-def test_normal_errors_are_centred_nearly_as_well_as_by_their_mean() -> None:
     learned, plain = deviation(NORMAL)
     assert learned < 1.2 * plain
 
@@ -40,8 +37,5 @@ def test_clean_masks_and_few_masks_teach_nothing() -> None:
     assert learn_mask_errors([0.02 * each for each in NORMAL]) is None
     assert learn_mask_errors([np.arange(ERRORS.least_masks - 1.0)]) is None
     assert learn_mask_errors([]) is None
-
-
-def test_winsorised_mean() -> None:
     assert winsorised_mean(np.array([0.0, 1, 2, 3, 100])) == pytest.approx(2)
     assert winsorised_mean(np.array([4.0])) == 4

@@ -60,10 +60,8 @@ def test_what_hides_the_leaf_says_nothing_and_areas_scale() -> None:
     hidden.inside[:2], hidden.others[:2] = False, 7
     assert measure_occupancy(hidden, SHEET).area == pytest.approx(AREA, rel=0.02)
     matrices = masks.px_from_world * np.array([0.1, 0.1, 0.1, 1])
-    larger, once = (
-        measure_occupancy(replace(masks, px_from_world=matrices), 10 * SHEET),
-        measure_occupancy(masks, SHEET),
-    )
+    larger = measure_occupancy(replace(masks, px_from_world=matrices), 10 * SHEET)
+    once = measure_occupancy(masks, SHEET)
     assert (larger.area, larger.sd) == pytest.approx((100 * once.area, 100 * once.sd))
 
 

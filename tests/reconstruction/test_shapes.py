@@ -56,10 +56,8 @@ def test_what_is_made_is_what_was_asked_for(shape: str) -> None:
 def test_results_have_no_crumbs_and_the_rule_of_the_paper_keeps_them() -> None:
     """A speck beside the blade, in the masks of all views at the same place in space."""
     speck = EllipticBlade(half_length=0.05, half_width=0.05)
-    maps = []
-    for near, far in zip(blade_masks(EllipticBlade(half_length=0.7), CAMERAS), speck_masks(speck), strict=True):
-        maps.append((near | far).astype(np.int64))
-    masks = as_regions(maps)
+    blade = blade_masks(EllipticBlade(half_length=0.7), CAMERAS)
+    masks = as_regions([near | far for near, far in zip(blade, speck_masks(speck), strict=True)])
     config = ReconstructConfig(shape="voxels", voxel_budget=60_000)
     plain = reconstruct_instances(*masks, CAMERAS, config=config)[1]
     voxels = reconstruct_voxels(*masks, CAMERAS, config=config)

@@ -56,7 +56,7 @@ def test_volume_of_what_cylinders_have_in_common(num_views: int, volume: float) 
 def test_votes_agree_with_points_projected_one_by_one() -> None:
     scene = ball_scene(3, 5, seed=2, focal=200.0, width=160, height=120)
     members = scene.regions.select(scene.regions.labels == 2)
-    grid = back_project(members, scene.cameras, config=ReconstructConfig(voxel_budget=4000))
+    grid = back_project(members, scene.cameras, config=ReconstructConfig(voxel_budget=2000))
     assert grid is not None
     index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
     centers = grid.origin + grid.voxel_size * (index + 0.5)
@@ -70,12 +70,8 @@ def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
     """It removes voxels, but none where another instance may hide the point, and leaves all other votes unchanged."""
     scene = ball_scene(4, 6, seed=2, focal=200.0, width=160, height=120)
     ids = scene.regions.labels
-    plain, seen = (
-        reconstruct_instances(
-            scene.regions, ids, scene.cameras, config=ReconstructConfig(voxel_size=0.12, seen_share=share)
-        )
-        for share in (0, 0.8)
-    )
+    configs = (ReconstructConfig(voxel_size=0.16, seen_share=share) for share in (0, 0.8))
+    plain, seen = (reconstruct_instances(scene.regions, ids, scene.cameras, config=each) for each in configs)
     removed = 0
     for instance, grid in seen.items():
         index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
@@ -86,7 +82,7 @@ def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
         assert ((grid.votes.flatten() - expected).abs() > 1e-6).float().mean() < 0.002
         removed += int(plain[instance].occupied.sum() - grid.occupied.sum())
         assert grid.mesh().is_watertight
-    assert removed > 100
+    assert removed > 40
 
 
 def test_what_stands_behind_something_is_not_carved_away() -> None:
@@ -130,7 +126,7 @@ def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
     assert grid is not None
     generator = torch.Generator().manual_seed(0)
     low, high = grid.origin, grid.origin + grid.voxel_size * torch.tensor(grid.votes.shape)
-    wide = (low + high) / 2 + (torch.rand(6_000, 3, generator=generator).double() - 0.5) * 2.2 * (high - low)
+    wide = (low + high) / 2 + (torch.rand(3_000, 3, generator=generator).double() - 0.5) * 2.2 * (high - low)
     votes = back_project_reference(members, scene.cameras, wide)
     inside = ((wide >= low) & (wide <= high)).all(1)
     assert (votes[inside] > 0.5).any()
@@ -163,9 +159,8 @@ def test_a_moved_and_scaled_world_moves_and_scales_the_shape() -> None:
 
 def test_grids_of_one_voxel_size_share_their_lattice() -> None:
     scene = ball_scene(3, 5, seed=4)
-    shapes = reconstruct_instances(
-        scene.regions, scene.regions.labels, scene.cameras, config=ReconstructConfig(voxel_size=0.07)
-    )
+    config = ReconstructConfig(voxel_size=0.07)
+    shapes = reconstruct_instances(scene.regions, scene.regions.labels, scene.cameras, config=config)
     assert sorted(shapes) == [1, 2, 3]
     for grid in shapes.values():
         steps = grid.origin / 0.07
@@ -205,20 +200,16 @@ def test_nearly_parallel_views_are_cut_not_lost() -> None:
     assert 0 < grid.volume < 1e5
 
 
-def test_an_empty_grid_has_an_empty_mesh() -> None:
+def test_an_empty_grid_has_an_empty_mesh_and_its_instance_is_left_out() -> None:
     regions, cameras = ball_from(AXES)
-    # one voxel, its centre beside the ball
-    grid = back_project(regions, cameras, config=ReconstructConfig(voxel_size=8.0))
+    coarse = ReconstructConfig(voxel_size=8.0)  # one voxel, its centre beside the ball
+    grid = back_project(regions, cameras, config=coarse)
     assert grid is not None
     assert not grid.occupied.any()
     assert grid.volume == 0
     assert len(grid.mesh().vertices) == 0
-
-
-def test_an_instance_without_a_voxel_is_left_out_and_warned_of() -> None:
-    regions, cameras = ball_from(AXES)
     with warns_of("no_shape"):
-        assert reconstruct_instances(regions, regions.labels, cameras, config=ReconstructConfig(voxel_size=8.0)) == {}
+        assert reconstruct_instances(regions, regions.labels, cameras, config=coarse) == {}
 
 
 @pytest.mark.parametrize(

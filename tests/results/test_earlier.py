@@ -12,6 +12,8 @@ from mvseg.cli import main
 from mvseg.errors import InputError
 from mvseg.results.earlier import KINDS, Output, check_out, replace_result
 
+Said, Patch = pytest.CaptureFixture[str], pytest.MonkeyPatch
+
 
 def write_output(out: Path, output: Output, file: str = "table.csv") -> Path:
     with replace_result(out, {}, output) as folder:
@@ -96,7 +98,7 @@ def test_a_place_behind_a_folder_that_is_not_there_is_looked_at(tmp_path: Path) 
 
 @pytest.mark.parametrize("arguments", ["target page.pdf", "check plant --out .", "check plant --target --out ."])
 def test_single_files_of_the_user_stay(
-    arguments: str, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    arguments: str, plant: Path, tmp_path: Path, monkeypatch: Patch, capsys: Said
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("page.pdf", "walk.svg", "target.json"):
@@ -108,9 +110,7 @@ def test_single_files_of_the_user_stay(
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="a folder that looks writable and is not, of Linux")
 @pytest.mark.parametrize("arguments", ["target /proc/page.pdf", "check . --out /proc/out", "track a b --out /proc/out"])
-def test_a_place_is_tried_before_the_work(
-    arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_place_is_tried_before_the_work(arguments: str, tmp_path: Path, monkeypatch: Patch, capsys: Said) -> None:
     """Nobody waits for a lock there; and a read-only folder is not noticed after the minutes of a run."""
     monkeypatch.chdir(tmp_path)
     words = arguments.split() + (["--times", "1", "2"] if arguments.startswith("track") else [])

@@ -35,19 +35,10 @@ from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
 from mvseg.system.file_hash import hash_files
 from mvseg.traits.measure import measure_plant
-from scene_folders import (
-    BALLS,
-    HEIGHT,
-    RADIUS,
-    WIDTH,
-    arc_pose,
-    draw_labels,
-    rig_content,
-    write_image,
-    write_scene,
-)
+from scene_folders import BALLS, HEIGHT, RADIUS, WIDTH, arc_pose, draw_labels, rig_content, write_image, write_scene
 from warned import warns_of
 
+Patch = pytest.MonkeyPatch
 DISTORTED = 2  # the view
 IDS_FILES = {
     *(f"labels/{view:03d}.png" for view in range(4)),
@@ -166,9 +157,10 @@ class TestVariants:
     def test_without_a_report(self, result: Result, tmp_path: Path) -> None:
         save_result(ids_only(result), tmp_path / "out", {}, report=False)
         assert files_below(tmp_path / "out") == IDS_FILES - {"report.html"}
+        assert (tmp_path / "out").stat().st_mode & 0o777 == 0o755  # other people can read it
 
     def test_leaves_have_few_triangles_in_the_scene_and_all_in_their_files(
-        self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, result: Result, tmp_path: Path, monkeypatch: Patch
     ) -> None:
         monkeypatch.setattr(mvseg.results.plant_files, "MAX_FACES", 300)
         save_result(result, tmp_path / "out", {})
@@ -382,9 +374,7 @@ class TestWholeOrNotAtAll:
             save_result(result, out, {})
         assert (out / "instances.json" / "thesis.txt").read_text() == "mine"
 
-    def test_a_disk_of_its_own_is_refused_before_the_work(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_a_disk_of_its_own_is_refused_before_the_work(self, tmp_path: Path, monkeypatch: Patch) -> None:
         replace, place = os.replace, tmp_path / "out"
         place.mkdir()
 
@@ -407,10 +397,6 @@ class TestWholeOrNotAtAll:
             assert files_below(tmp_path / "disk" / "out") == IDS_FILES
             assert (tmp_path / "link").is_symlink()
             assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "link"]
-
-    def test_other_people_can_read_it(self, result: Result, tmp_path: Path) -> None:
-        save_result(ids_only(result), tmp_path / "out", {})
-        assert (tmp_path / "out").stat().st_mode & 0o777 == 0o755
 
 
 class TestPlaces:
@@ -442,10 +428,6 @@ class TestPlaces:
 
 
 class TestReadInstances:
-    @pytest.fixture
-    def broken(self, saved: Path, tmp_path: Path) -> Path:
-        return shutil.copytree(saved, tmp_path / "broken")
-
     def test_no_truth(self, saved: Path, tmp_path: Path) -> None:
         with pytest.raises(InputError, match="absent: no such folder of true labels"):
             read_instances(saved, tmp_path / "absent")
@@ -455,15 +437,12 @@ class TestReadInstances:
         [
             ("image_id", 99, r"annotations\[3\]: there is no image 99"),
             ("instance_id", "first", r"annotations\[3\]\.instance_id: Input should be a valid integer"),
-            (
-                "segmentation",
-                {"size": [HEIGHT, WIDTH], "counts": "0"},
-                r"annotations\[3\]: its run lengths do not add up",
-            ),
+            ("segmentation", {"size": [HEIGHT, WIDTH], "counts": "0"}, r"annotations\[3\]: its run lengths do not add"),
             ("segmentation", None, r"annotations\[3\]\.segmentation"),
         ],
     )
-    def test_edited(self, broken: Path, plant: Path, key: str, value: object, message: str) -> None:
+    def test_edited(self, saved: Path, tmp_path: Path, plant: Path, key: str, value: object, message: str) -> None:
+        broken = shutil.copytree(saved, tmp_path / "broken")
         content = json.loads((broken / "instances.json").read_text())
         content["annotations"][3][key] = value
         (broken / "instances.json").write_text(json.dumps(content))

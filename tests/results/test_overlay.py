@@ -29,16 +29,13 @@ def regions() -> Regions:
     return regions_from_label_maps([labels, labels[:, ::-1]])
 
 
-def test_colours_differ() -> None:
+def test_colours_differ_and_an_instance_has_one_in_every_view(regions: Regions) -> None:
     colors = [instance_color(instance) for instance in range(1, 41)]
     assert len(set(colors)) == 40
     assert instance_color(-1) == UNMATCHED
     assert UNMATCHED not in colors
     gaps = [np.abs(np.subtract(color, following)).max() for color, following in pairwise(colors)]
     assert min(gaps) > 60  # neighbouring numbers
-
-
-def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
     ids = masks(regions, [5, 1, 5, 1])
     first, second = (draw_overlay(GREY, ids, view=view) for view in (0, 1))
     tint = (0.45 * 90 + 0.55 * np.array(instance_color(5))).astype(np.uint8)
@@ -57,9 +54,6 @@ def test_drawing_in_the_box_of_a_mask_is_drawing_in_the_whole_picture() -> None:
     outlines, _ = cv2.findContours(labels.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(expected, outlines, -1, UNMATCHED, 1)
     np.testing.assert_array_equal(draw_overlay(GREY, masks(regions, [-1]), view=0), expected)
-
-
-def test_a_mask_that_is_too_small_for_the_picture_is_not_drawn() -> None:
     labels = np.zeros((2400, 3200), np.uint16)
     labels[12, 13] = 1  # between the pixels that the overlay takes
     photo = np.full((2400, 3200, 3), 90, np.uint8)
@@ -91,7 +85,7 @@ def test_unmatched_regions_are_grey_and_without_number(regions: Regions) -> None
     assert numbered.max() == 255  # the white rim of a number
 
 
-def test_large_photos_are_scaled_down() -> None:
+def test_large_photos_are_scaled_down_and_a_view_without_regions_is_the_photo(regions: Regions) -> None:
     labels = np.zeros((1000, 4000), np.uint16)
     labels[400:600, 1000:1400] = 1
     photo = np.full((1000, 4000, 3), 90, np.uint8)
@@ -99,9 +93,6 @@ def test_large_photos_are_scaled_down() -> None:
     assert painted.shape == (400, MAX_SIDE, 3)
     tint = (0.45 * 90 + 0.55 * np.array(instance_color(1))).astype(np.uint8)
     assert (painted[165:170, 405:410] == tint).all()
-
-
-def test_a_view_without_regions_is_the_photo(regions: Regions) -> None:
     nothing = regions.select(regions.view_index == 1)
     np.testing.assert_array_equal(draw_overlay(GREY, masks(nothing, [1, 2]), view=0), GREY)
 

@@ -26,16 +26,13 @@ def make_leaf(blade: Blade, azimuth: float = 0.4, elevation: float = 0.0) -> Lea
     return leaf_from_blade(1, place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth=azimuth, elevation=elevation))
 
 
-def test_flat_blade_has_the_area_of_its_outline() -> None:
+def test_a_flat_blade_has_the_area_of_its_outline_and_faces_up() -> None:
     u, half = blade_stations(FLAT.rows) * FLAT.length, np.concatenate([[0], half_widths(FLAT), [0]])
     trapezoids = float(np.sum((half[1:] + half[:-1]) * np.diff(u)))
     leaf = make_leaf(FLAT)
     assert leaf.area == pytest.approx(trapezoids, rel=1e-12)
     assert leaf.length == pytest.approx(70, rel=1e-12)
     assert leaf.width == pytest.approx(40, rel=1e-12)
-
-
-def test_upper_side_of_a_level_blade_faces_up() -> None:
     leaf = make_leaf(FLAT)
     corner = leaf.vertices[leaf.faces]
     normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])

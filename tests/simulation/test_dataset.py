@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from benchmarks.label_maps import plant_index
+from csv_rows import read_rows
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.simulation import dataset
@@ -110,8 +110,7 @@ def test_coco_file_agrees_with_the_truth(tiny: Path) -> None:
 
 
 def test_list_of_scenes_names_every_folder(tiny: Path) -> None:
-    with (tiny / "scenes.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(tiny / "scenes.csv")
     assert len(rows) == 4
     for row in rows:
         assert (tiny / row["folder"] / "cameras.json").exists()

@@ -10,6 +10,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import SimulatedPlant, grow_plant, grow_shoots
+from rendered import flatten
 
 
 def share_of_crossing_leaves(plant: SimulatedPlant) -> float:
@@ -65,12 +66,6 @@ def test_leggy_stems_are_bare() -> None:
         shoots = [grow_shoots(8, FAMILIES[family], np.random.default_rng(seed))[1] for seed in range(20)]
         lowest[family] = np.median([nodes[0].point[2] for nodes in shoots])
     assert lowest["leggy"] > 2 * lowest["ovate"]
-
-
-def flatten(plant: SimulatedPlant) -> bytes:
-    meshes = [(leaf.vertices, leaf.faces) for leaf in plant.leaves]
-    meshes += [(part.vertices, part.faces) for part in plant.parts]
-    return b"".join(array.tobytes() for mesh in meshes for array in mesh)
 
 
 @pytest.mark.parametrize("family", FAMILIES)

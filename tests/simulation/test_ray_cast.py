@@ -96,31 +96,25 @@ def test_ids_and_depths_agree_with_opencv_projection(family: str, view: int) -> 
     assert np.allclose(shot.depth[seen], depth[seen], rtol=1e-4)
 
 
-def test_pixel_centres_decide() -> None:
+def test_pixel_centres_decide_and_a_ray_that_hits_nothing_is_infinitely_long() -> None:
     cameras = look_down(100.0, focal=100.0, size=(8, 6))  # one unit of the plane is one pixel
     square = make_square(7, [[-2.4, 1.4, 0], [-2.4, -1.6, 0], [1.6, -1.6, 0], [1.6, 1.4, 0]])
     ids = render_view(SimulatedPlant("ovate", (square,), ()), cameras, 0, seed=0).ids
     expected = np.zeros((6, 8), np.uint16)
     expected[2:5, 2:6] = 7  # rows 1.6 to 4.6 and columns 1.6 to 5.6 hold the centres 2.5 to 4.5 and 2.5 to 5.5
     assert ids.tolist() == expected.tolist()
-
-
-def test_a_ray_that_hits_nothing_is_infinitely_long() -> None:
     stake = Part("stake", np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2]], np.int32))
     away = render_view(SimulatedPlant("ovate", (), (stake,)), look_up(-50.0), 0, seed=0)
     assert np.isinf(away.depth).all()
     assert not away.ids.any()
 
 
-def test_ids_and_depths_do_not_depend_on_the_look() -> None:
+def test_ids_and_depths_do_not_depend_on_the_look_and_views_share_the_light() -> None:
     plant = grow_plant("compound", 12, seed=4)
     one, two = shoot(plant, seed=1), shoot(plant, seed=2)
     assert np.array_equal(one.ids, two.ids)
     assert np.array_equal(one.depth, two.depth)
     assert np.abs(one.rgb.astype(int) - two.rgb).mean() > 5
-
-
-def test_views_share_the_light_but_not_the_noise() -> None:
     stage = build_stage(SimulatedPlant("ovate", (make_level_square(1, 900, 0),), ()), seed=0)
     cameras = [look_down(height, size=(64, 64)) for height in (300.0, 300.5)]
     one, two = (render_stage(stage, some, 0).rgb.astype(float) for some in cameras)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -12,6 +11,7 @@ import pytest
 import torch
 import trimesh
 
+from csv_rows import read_rows
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
@@ -82,9 +82,8 @@ def test_masks_are_a_new_numbering_of_the_truth_in_every_view(scene: Path) -> No
     assert len({tuple(numbering[leaf] for leaf in sorted(shared)) for numbering in numberings}) == 3
 
 
-def test_truth_sizes_and_meshes_are_those_of_the_leaves(scene: Path, plant: SimulatedPlant) -> None:
-    with (scene / "truth" / "traits.csv").open() as file:
-        rows = list(csv.DictReader(file))
+def test_sizes_meshes_and_photo_are_those_of_the_plant(scene: Path, plant: SimulatedPlant, cameras: Cameras) -> None:
+    rows = read_rows(scene / "truth" / "traits.csv")
     assert [int(row["leaf_id"]) for row in rows] == [leaf.leaf_id for leaf in plant.leaves]
     for row, leaf in zip(rows, plant.leaves, strict=True):
         sizes = [float(row[name]) for name in ("length", "width", "area")]
@@ -93,9 +92,6 @@ def test_truth_sizes_and_meshes_are_those_of_the_leaves(scene: Path, plant: Simu
         assert mesh.area == pytest.approx(leaf.area, rel=1e-4)
         assert mesh.bounds == pytest.approx(np.stack([leaf.vertices.min(0), leaf.vertices.max(0)]), abs=1e-3)
     assert len(list((scene / "truth" / "leaves").iterdir())) == len(plant.leaves)
-
-
-def test_photo_is_the_rendering(scene: Path, plant: SimulatedPlant, cameras: Cameras) -> None:
     rgb = render_view(plant, cameras, 0, seed=5).rgb
     photo = cv2.imread(str(scene / "images" / "000.jpg"))[..., ::-1]
     assert np.abs(photo.astype(int) - rgb).mean() < 8  # JPEG

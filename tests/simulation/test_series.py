@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.demo_plant import grow_later
+from csv_rows import read_rows
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_labels
 from mvseg.simulation.growth import grow_plant
@@ -18,7 +18,7 @@ from mvseg.simulation.series import PotPlace, SeriesSpec, draw_pots, grow_series
 SPEC = SeriesSpec("ovate-00", "ovate", leaves=(5, 3), times=(0.0, 4.0, 9.0), seed=3, falls=0.5)
 
 
-def test_leaves_grow_and_new_ones_appear_above() -> None:
+def test_leaves_grow_new_ones_appear_above_and_old_ones_yellow_and_fall() -> None:
     plants = grow_series(replace(SPEC, turns=False, falls=0.0))
     ids = [[leaf.leaf_id for leaf in plant.leaves] for plant in plants]
     assert len(ids[0]) == 5
@@ -29,9 +29,6 @@ def test_leaves_grow_and_new_ones_appear_above() -> None:
         assert lengths[-1] > 0.9 * lengths[0]
     heights = {leaf.leaf_id: leaf.vertices[0, 2] for leaf in plants[-1].leaves}
     assert min(heights[leaf] for leaf in set(ids[-1]) - set(ids[0])) > np.median([heights[leaf] for leaf in ids[0]])
-
-
-def test_old_leaves_yellow_and_fall() -> None:
     growing = plan_plant(replace(SPEC, leaves=(12, 0), falls=1.0, times=(0.0, 30.0)))
     counts = [len(growing.at(day).leaves) for day in (0.0, 15.0, 30.0)]
     assert counts[0] > counts[-1]
@@ -53,11 +50,9 @@ def test_pots_are_turned_rigidly_and_the_same_seed_gives_the_same_series() -> No
 def test_scenes_and_truth_over_time_are_written(tmp_path: Path) -> None:
     spec = replace(SPEC, times=(0.0, 4.0), num_views=(2, 3), size=(96, 96))
     write_series(tmp_path / "series", [spec])
-    with (tmp_path / "series" / "series.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(tmp_path / "series" / "series.csv")
     assert [(row["plant"], row["time"]) for row in rows] == [("ovate-00", "0"), ("ovate-00", "4")]
-    with (tmp_path / "series" / "truth.csv").open() as file:
-        truth = list(csv.DictReader(file))
+    truth = read_rows(tmp_path / "series" / "truth.csv")
     known = {(row["scene"], int(row["leaf"])) for row in truth}
     for row, views in zip(rows, (2, 3), strict=True):
         labels = sorted((tmp_path / "series" / row["scene"] / "truth").glob("*.png"))

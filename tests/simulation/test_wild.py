@@ -10,15 +10,9 @@ import trimesh
 
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES
-from mvseg.simulation.growth import SimulatedPlant, grow_plant
+from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.wild import make_wild
-from rendered import render_view
-
-
-def flatten(plant: SimulatedPlant) -> bytes:
-    meshes = [(leaf.vertices, leaf.faces) for leaf in plant.leaves]
-    meshes += [(part.vertices, part.faces) for part in plant.parts]
-    return b"".join(array.tobytes() for mesh in meshes for array in mesh)
+from rendered import flatten, render_view
 
 
 @pytest.mark.parametrize("family", FAMILIES)

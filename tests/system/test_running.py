@@ -21,7 +21,7 @@ from mvseg.system.running import SILENT, now_running, progress_bar, report_step,
 from mvseg.system.threads import on_one_thread
 
 
-def test_it_holds_inside_only_and_nests() -> None:
+def test_it_holds_inside_only_nests_and_ends_with_an_error() -> None:
     with running(progress=True):
         with running(num_workers=2):
             assert (bool(now_running().progress), len(now_running().workers)) == (True, 2)
@@ -29,9 +29,6 @@ def test_it_holds_inside_only_and_nests() -> None:
                 assert (bool(now_running().progress), len(now_running().workers)) == (False, 1)
         assert (bool(now_running().progress), now_running().workers) == (True, ())
     assert not now_running().progress
-
-
-def test_it_ends_with_an_error() -> None:
     with pytest.raises(InputError, match=r"^num_workers is 0"), running(progress=True, num_workers=0):
         pass
     with pytest.raises(KeyboardInterrupt), running(progress=True):

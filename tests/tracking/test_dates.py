@@ -23,14 +23,11 @@ from mvseg.traits.nodes import UNCLEAR, Node, Stem
 from tests.plants_over_days import fit_blade, grow_blades, see, write_result
 
 
-def test_times_are_days() -> None:
+def test_times_are_days_and_eight_digits_a_date() -> None:
     assert read_time("3.5") == 3.5
     assert read_time("2026-03-02") - read_time("2026-02-27") == 3
     assert read_time("2026-03-02T12:00") - read_time("2026-03-02") == 0.5
     assert (read_time("1e2"), read_time(".5"), read_time(-1e-3), read_time(0)) == (100, 0.5, -0.001, 0)
-
-
-def test_eight_digits_are_a_date() -> None:
     assert read_time("20260601") == read_time(20260601) == read_time("2026-06-01")
     dates = [replace(see(grow_blades(4, 0), 0)[0], scene=text, written=text, time=read_time(text))
              for text in ("20260531", "2026-06-06")]  # fmt: skip

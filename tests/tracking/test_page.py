@@ -19,8 +19,10 @@ from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
 from mvseg.tracking.pictures import LeafPicture, cut_picture, draw_pictures
 from mvseg.tracking.track import TrackRow, Tracks
-from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
+from report_browser import CHROMIUM, NO_WEBGL, Opened, browser_with, sync_api
 from tests.plants_over_days import grow_blades, grown, see, write_result
+
+browser = browser_with(*NO_WEBGL)
 
 
 def noisy_picture() -> LeafPicture:
@@ -75,7 +77,7 @@ def test_plants_are_shown_in_one_frame_where_they_are_aligned() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
-def test_the_page_in_a_browser(tmp_path: Path) -> None:
+def test_the_page_in_a_browser(browser: sync_api.Browser, tmp_path: Path) -> None:
     tracks = many_dates(6, 4)
     numbers = {"node_height": Number(30.0, 2.0, "mm"), "node_azimuth": Number(350.0, 5.0, "degree")}
     leaves = [replace(leaf, node=(1, 1), numbers=leaf.numbers | numbers) for leaf in tracks.dates[0].leaves]
@@ -84,36 +86,33 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
     first = replace(tracks.dates[0], leaves=(*leaves[:3], tracks.dates[0].leaves[3]))
     tracks = replace(tracks, dates=(first, *tracks.dates[1:]), poses=poses)
     write_page(tmp_path, tracks, measure_growth(tracks))
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
-        opened = Opened(browser, tmp_path / "tracks.html", (1300, 900), has_space=False)
-        shown = opened.page
-        assert shown.locator("#plant").inner_text() == "=<b>basil"
-        assert shown.locator("#warnings li").inner_text() == "a <warning>"
-        assert shown.locator("#dates canvas").count() == 6
-        assert shown.locator("#chart polyline").count() == 4
-        assert [one.locator("circle").count() for one in shown.locator("#dates .stems").all()] == [3, 0, 0, 0, 0, 0]
-        before = shown.evaluate("document.querySelector('canvas').toDataURL()")
-        for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
-            shown.keyboard.press(key)
-        assert shown.locator("#leaf").inner_text() == "Leaf 2"
-        assert shown.locator("#crops img").count() == shown.locator("#crops canvas.alone").count() == 6
-        assert shown.locator("#chart polygon").count() == 1  # its band
-        assert shown.evaluate("document.querySelector('canvas').toDataURL()") != before
-        shown.keyboard.press("Escape")
-        assert shown.locator("#leaf").inner_text() == "All leaves"
-        data = json.loads(shown.locator("#data").text_content() or "")
-        assert data["leaves"][0]["node"] == {"azimuth": 20.0, "stem": 1, "node": 1, "height": 30.0, "sd": 2.0}
-        leaf = data["leaves"][0]
-        shown.locator("tbody tr").nth(leaf["track"] - 1).click()
-        assert shown.locator("#leaf").inner_text() == f"Leaf {leaf['track']}"
-        opened.close()  # offline, and without a complaint
-        browser.close()
+    opened = Opened(browser, tmp_path / "tracks.html", (1300, 900), has_space=False)
+    shown = opened.page
+    assert shown.locator("#plant").inner_text() == "=<b>basil"
+    assert shown.locator("#warnings li").inner_text() == "a <warning>"
+    assert shown.locator("#dates canvas").count() == 6
+    assert shown.locator("#chart polyline").count() == 4
+    assert [one.locator("circle").count() for one in shown.locator("#dates .stems").all()] == [3, 0, 0, 0, 0, 0]
+    before = shown.evaluate("document.querySelector('canvas').toDataURL()")
+    for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
+        shown.keyboard.press(key)
+    assert shown.locator("#leaf").inner_text() == "Leaf 2"
+    assert shown.locator("#crops img").count() == shown.locator("#crops canvas.alone").count() == 6
+    assert shown.locator("#chart polygon").count() == 1  # its band
+    assert shown.evaluate("document.querySelector('canvas').toDataURL()") != before
+    shown.keyboard.press("Escape")
+    assert shown.locator("#leaf").inner_text() == "All leaves"
+    data = json.loads(shown.locator("#data").text_content() or "")
+    assert data["leaves"][0]["node"] == {"azimuth": 20.0, "stem": 1, "node": 1, "height": 30.0, "sd": 2.0}
+    leaf = data["leaves"][0]
+    shown.locator("tbody tr").nth(leaf["track"] - 1).click()
+    assert shown.locator("#leaf").inner_text() == f"Leaf {leaf['track']}"
+    opened.close()  # offline, and without a complaint
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
-def test_growth_at_a_glance_on_a_phone(tmp_path: Path) -> None:
+def test_growth_at_a_glance_on_a_phone(browser: sync_api.Browser, tmp_path: Path) -> None:
     """Leaf 3 is new on the second date, leaf 1 gone."""
     tracks, photo = many_dates(2, 4), noisy_picture().jpeg
     state = {(1, 3): "born", (1, 1): "gone"}
@@ -128,21 +127,18 @@ def test_growth_at_a_glance_on_a_phone(tmp_path: Path) -> None:
                   for date, of in zip(dates, kept, strict=True))  # fmt: skip
     changed = replace(tracks, dates=dates, rows=rows)
     write_page(tmp_path, changed, measure_growth(changed))
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
-        opened = Opened(browser, tmp_path / "tracks.html", (420, 900), has_space=False)
-        shown = opened.page
-        assert shown.evaluate("document.documentElement.scrollWidth") <= 420
-        boxes = [each.bounding_box() for each in shown.locator("#dates canvas").all()]
-        assert all(box is not None and box["x"] + box["width"] <= 420 for box in boxes)  # both are seen whole
-        assert "3 leaves" in shown.locator("#dates figcaption").nth(1).inner_text()
-        assert "1 new · 1 gone" in shown.locator("#dates figcaption").nth(1).inner_text()
-        assert "days" in shown.locator("#chart text").all_text_contents()
-        assert shown.locator("#chart image").count() == 2
-        assert shown.locator("#chart .born").count() == shown.locator("#chart .gone").count() == 1
-        from_below = [row.locator("td").first.inner_text() for row in shown.locator("tbody tr").all()]
-        assert from_below == ["1", "2", "3", "4"]
-        shown.locator("#trait").select_option("relative growth rate")
-        assert shown.locator("#chart circle").count() == 1
-        opened.close()
-        browser.close()
+    opened = Opened(browser, tmp_path / "tracks.html", (420, 900), has_space=False)
+    shown = opened.page
+    assert shown.evaluate("document.documentElement.scrollWidth") <= 420
+    boxes = [each.bounding_box() for each in shown.locator("#dates canvas").all()]
+    assert all(box is not None and box["x"] + box["width"] <= 420 for box in boxes)  # both are seen whole
+    assert "3 leaves" in shown.locator("#dates figcaption").nth(1).inner_text()
+    assert "1 new · 1 gone" in shown.locator("#dates figcaption").nth(1).inner_text()
+    assert "days" in shown.locator("#chart text").all_text_contents()
+    assert shown.locator("#chart image").count() == 2
+    assert shown.locator("#chart .born").count() == shown.locator("#chart .gone").count() == 1
+    from_below = [row.locator("td").first.inner_text() for row in shown.locator("tbody tr").all()]
+    assert from_below == ["1", "2", "3", "4"]
+    shown.locator("#trait").select_option("relative growth rate")
+    assert shown.locator("#chart circle").count() == 1
+    opened.close()

@@ -101,15 +101,12 @@ def two_in_a_pot(turn: float, other: Blades) -> tuple[list[PlantOnDate], list[li
     return [date for date, _ in seen], [truth for _, truth in seen]
 
 
-def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
+def test_two_plants_in_one_pot_keep_their_tracks_even_where_one_is_turned() -> None:
     dates, truths = two_in_a_pot(0, grow_blades(8, 31))
     tracks = track_leaves(dates)
     assert tracks.findings == ()
     assert tracks.num_tracks == 18
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
-
-
-def test_a_plant_whose_neighbour_was_turned_in_the_pot_keeps_its_own_tracks() -> None:
     dates, truths = two_in_a_pot(120, grow_blades(8, 31))
     tracks = [found for found in true_tracks(track_leaves(dates), truths).values() if found & set(BLADES)]
     assert sorted(tracks, key=min) == [{leaf} for leaf in sorted(BLADES)]

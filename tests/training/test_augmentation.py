@@ -102,7 +102,7 @@ def test_colour_blur_light_and_faults_change_the_photo_only(change: str) -> None
     assert 0 <= float(photo.min()) <= float(photo.max()) <= 1
 
 
-def test_target() -> None:
+def test_targets_of_instances_and_of_none() -> None:
     layers = torch.zeros((2, 10, 12), dtype=torch.int32)
     layers[0, 2:5, 3:9] = 1
     layers[0, 8, :4] = 2
@@ -112,9 +112,6 @@ def test_target() -> None:
     assert target["boxes"].tolist() == [[3, 2, 9, 5], [4, 1, 7, 9]]  # half-open
     assert (target["boxes"].dtype, target["masks"].dtype) == (torch.float32, torch.uint8)
     assert target["masks"].sum((1, 2)).tolist() == [18, 24]
-
-
-def test_empty_target() -> None:
     target = make_target(torch.zeros((1, 4, 5), dtype=torch.int32), torch.zeros(0, dtype=torch.int64))
     assert {key: tuple(value.shape) for key, value in target.items()} == {
         "boxes": (0, 4), "labels": (0,), "masks": (0, 4, 5)}  # fmt: skip

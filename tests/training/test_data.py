@@ -91,7 +91,7 @@ def test_label_map(tmp_path: Path, dtype: Any) -> None:
     assert not labelled.ignore.any()
 
 
-def test_ignored_pixels_and_a_map_without_background(tmp_path: Path) -> None:
+def test_ignored_pixels_a_map_without_background_and_an_empty_photo(tmp_path: Path) -> None:
     labels = np.where(SQUARE, 65535, 5).astype(np.uint16)
     labels[0] = 2
     labelled = read_pair(tmp_path, labels)
@@ -99,9 +99,6 @@ def test_ignored_pixels_and_a_map_without_background(tmp_path: Path) -> None:
     np.testing.assert_array_equal(masks_of(labelled), [labels == 2, labels == 5])
     full = read_pair(tmp_path, np.full((HEIGHT, WIDTH), 4, np.uint16))
     assert masks_of(full)[0].all()
-
-
-def test_an_empty_photo_is_a_sample(tmp_path: Path) -> None:
     labelled = read_pair(tmp_path, np.zeros((HEIGHT, WIDTH), np.uint8))
     assert (len(labelled.classes), labelled.layers.shape) == (0, (1, HEIGHT, WIDTH))
     assert not labelled.layers.any()
@@ -214,7 +211,7 @@ def test_broken_annotations(tmp_path: Path, annotation: dict[str, Any], message:
     ("changes", "message"),
     [
         ({"images": [IMAGE | {"height": 5, "width": 5}]}, "its COCO entry says 5 x 5"),
-        ({"images": [IMAGE | {"file_name": "b.png"}]}, r"b.png: the photo .* is missing"),
+        ({"images": [IMAGE | {"file_name": "b.png"}]}, r"b.png: the photo .*b.png cannot be read, .*: No such file"),
         ({"images": [IMAGE | {"id": 8}]}, "annotations of image 7"),
         ({"images": [], "annotations": []}, "lists 0 images"),
         ({"categories": []}, "0 categories"),
@@ -247,8 +244,8 @@ def test_broken_label_maps(tmp_path: Path) -> None:
         "b_no_mask.png: .*b_no_mask.png: the mask file is missing",
         "c_size.png: .*c_size.png: the mask is 16 x 5, its photo is 16 x 12",
         "e_torn.png: .* cannot be read, expected a whole label PNG",
-        "f_photo.png: the photo cannot be read",
-        "g_no_photo.*: the photo .* is missing",
+        "f_photo.png: the photo .*f_photo.png cannot be read, expected a whole image file",
+        "g_no_photo.*: the photo .* cannot be read, .*: No such file",
     )
     assert len(broken) == len(expected)
     for sentence, pattern in zip(broken.values(), expected, strict=True):

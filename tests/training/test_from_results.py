@@ -102,14 +102,11 @@ def test_what_cannot_be_learned_from_is_named(result: Path, scene: Path, tmp_pat
         list_results(result)
 
 
-def test_changed_photos_are_refused(result: Path, scene: Path) -> None:
+def test_changed_photos_and_nothing_to_learn_from_are_refused(result: Path, scene: Path) -> None:
     photo = scene / "images" / "000.jpg"
     Image.open(photo).resize((320, 480)).save(photo)
     with pytest.raises(InputError, match="its COCO entry says 640 x 480"):
         read_sample(list_results(result).samples[0])
-
-
-def test_something_must_be_learned_from(result: Path) -> None:
     assert make_config(Path(), Path(), photos=None, labels=None, from_results=result).from_results == result
     with pytest.raises(InputError, match="neither photos nor from_results"):
         make_config(Path(), Path(), photos=None, labels=None)

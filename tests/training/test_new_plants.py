@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
+from mvseg.training import augmentation
 from mvseg.training.augmentation import AugmentedSamples
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import SampleList
@@ -46,15 +47,17 @@ def test_backgrounds_are_seen_behind_some_plants_and_never_on_a_leaf(backgrounds
     assert num_seen == 1
 
 
-def test_an_epoch_ends_with_new_plants_and_the_next_one_has_others() -> None:
+def test_an_epoch_ends_with_new_plants_and_the_next_one_has_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds: list[int] = []
+    monkeypatch.setattr(augmentation, "render_new_plant", lambda seed, *_: seeds.append(seed) or rendered(5))
     config = TrainConfig(output=Path("out"), from_results=Path("results"), image_size=64, seed=1, new_plants=2)
     samples = AugmentedSamples(SampleList((), ("leaf",)), config)
     assert len(samples) == 2
-    photo, target, index = samples[0, 1]
+    (photo, target, index), _ = samples[0, 1], samples[1, 1]
     assert photo.shape == (3, 64, 64)
     assert index == 1
     assert len(target["boxes"])
-    assert not torch.equal(photo, samples[1, 1][0])
+    assert len({*seeds}) == len(seeds) == 2
 
 
 def test_grey_leaves_get_a_colour_and_stand_on_the_background(backgrounds: tuple[Path, ...]) -> None:

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from mvseg.training.photo_faults import (
-    add_clutter,
-    spoil,
-    tint_leaves,
-)
+from mvseg.training.photo_faults import add_clutter, spoil, tint_leaves
 
 
 def noisy_photo(height: int = 48, width: int = 64) -> torch.Tensor:

@@ -84,9 +84,6 @@ def test_visible_share_counts_all_views(tmp_path: Path) -> None:
     assert found["visible_share"].value == pytest.approx((masks[0].sum() + sizes[2]) / sum(sizes))
     assert not found["mean_red"].exists
     assert found["mean_red"].method == "not measured: there are no photos"
-
-
-def test_a_leaf_outside_all_photos_has_no_share(tmp_path: Path) -> None:
     far = flat_leaf(length=2, half_width=0.45, at=(-40, 30, 0))
     empty = [np.zeros((SIZE, SIZE), bool)] * 3
     photos = Photos(scene_of(tmp_path, [painted(empty[0], GREEN)] * 3))

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import torch
 from blade_scene import SIZE, ring_cameras
 from known_leaves import turn_about
 from mvseg.errors import InputError
+from mvseg.formats import markers
 from mvseg.formats.image_file import write_png
 from mvseg.scene import Cameras, Scene, View
 from mvseg.traits.up import find_up, up_of_board
@@ -41,12 +43,14 @@ def photograph(folder: Path, cameras: Cameras, board: np.ndarray) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     board = np.full((BOARD_PX, BOARD_PX), 255, np.uint8)
     family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_1000)
     for number, (row, column) in enumerate(((30, 30), (30, 230), (230, 130))):
         board[row : row + 140, column : column + 140] = cv2.aruco.generateImageMarker(family, 7 + number, 140)
-    return photograph(tmp_path_factory.mktemp("board"), large_ring(), board)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(markers, "FAMILIES", ("5X5_1000",))  # to look for all of them takes seconds
+        yield photograph(tmp_path_factory.mktemp("board"), large_ring(), board)
 
 
 @pytest.fixture(scope="module")

@@ -20,12 +20,9 @@ def plant() -> dict[int, LeafSurface]:
     return {i: move(bent_blade(), turn_about(UP, 137 * i), shift=(0, 0, 20 * i - 10)) for i in (1, 2, 3, 4)}
 
 
-def test_leaves_are_leaves() -> None:
+def test_leaves_are_leaves_and_what_is_slender_a_stem_unless_all_instances_are_wanted() -> None:
     for shapes in (plant(), {}, {1: flat_leaf()}):
         assert find_rejected(shapes, config=CONFIG) == {}
-
-
-def test_what_is_slender_is_a_stem_unless_all_instances_are_wanted() -> None:
     shapes, chances = plant(), {1: 0.95, 2: 0.85, 3: 0.02, 7: 0.99}  # 7 has no shape
     found = find_rejected(shapes, config=CONFIG, stems=chances)
     assert {i: rejection.kind for i, rejection in found.items()} == {1: "stem", 7: "stem"}

@@ -112,14 +112,11 @@ def test_turning_about_up_changes_the_azimuth_only(degrees: float) -> None:
         assert second[name].sd == pytest.approx(number.sd, rel=1e-3)
 
 
-def test_azimuths_are_wrapped_and_0_just_below_a_full_turn() -> None:
+def test_azimuths_count_from_x_to_y_and_are_wrapped() -> None:
     wrapped = {-90: "270", -0.001: "359.999", 359.9994: "359.999", 12: "12"}
     for degrees, written in {**wrapped, **dict.fromkeys((-1e-15, 360.0, -1e-6, 359.9997, 720 - 1e-12), "0")}.items():
         assert format_number(wrap_azimuth(degrees)) == written
     assert np.isnan(wrap_azimuth(float("nan")))
-
-
-def test_azimuth_counts_from_x_to_y() -> None:
     quarter = move(flat_leaf(), turn_about(FRAME[2], 90))
     assert measure(quarter)["azimuth"] == pytest.approx(90)
     sideways = level_frame((0.0, 1.0, 0.0))  # up is y: from x to -z
@@ -147,22 +144,16 @@ def test_angles_at_their_kinks_have_deviations_too() -> None:
         assert 0.1 * tilted[name].sd < flat[name].sd < 10 * tilted[name].sd
 
 
-def test_a_leaf_that_hangs_straight_down_has_no_azimuth() -> None:
+def test_what_is_unknown_empties_what_needs_it() -> None:
     for tilt, is_there in ((90, False), (-89.99, False), (85, True)):
         number = measure_leaf(move(flat_leaf(), turn_about(np.array([0, 1.0, 0]), tilt)), FRAME)["azimuth"]
         assert number.exists == is_there
         assert is_there or number.method == "not measured: the leaf points nearly straight up or down"
-
-
-def test_unknown_base_empties_what_needs_it() -> None:
     known = measure_leaf(bent_blade(), FRAME)
     numbers = measure_leaf(replace(bent_blade(), is_oriented=False), FRAME)
     assert {name for name, number in numbers.items() if not number.exists} == set(NEED_BASE)
     assert all("base and tip" in numbers[name].method for name in NEED_BASE)
     assert numbers["curvature"] == known["curvature"]
-
-
-def test_unknown_up_empties_what_needs_it() -> None:
     numbers = measure_leaf(bent_blade(), None)
     assert numbers.keys() == {trait.name for trait in SURFACE_TRAITS}
     assert {name for name, number in numbers.items() if not number.exists} == set(NEED_UP)

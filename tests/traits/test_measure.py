@@ -11,7 +11,7 @@ from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, move, turn_about
 from matched import matched
 from mvseg.matching.result import Matching
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
@@ -97,7 +97,7 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     matching, surfaces = make_inputs([1, 2, 3, 4])
     surfaces[2] = LeafSurface.none(torch.arange(3), "no_common_point", "its masks agree on no point")
     surfaces[4] = LeafSurface.none(torch.arange(1), "one_view", "seen in one view only")
-    surfaces[3] = replace(surfaces[3], quality=Quality({"two_views": "seen in two views only"}))
+    surfaces[3] = replace(surfaces[3], reasons={"two_views": "seen in two views only"})
     traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
     good, voxels, doubted, nothing = traits.leaves
     assert [leaf.method for leaf in traits.leaves] == ["surface", "voxels", "surface", "none"]

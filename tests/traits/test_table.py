@@ -1,12 +1,12 @@
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from csv_rows import read_rows
 from mvseg.formats.text_file import escape_text, format_number
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
@@ -35,15 +35,10 @@ def traits_of(**changes: object) -> Traits:
     return replace(traits, **changes)  # type: ignore[arg-type]
 
 
-def read(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
 @pytest.fixture
 def long(tmp_path: Path) -> list[dict[str, str]]:
     write_long(tmp_path / "traits.csv", traits_of())
-    return read(tmp_path / "traits.csv")
+    return read_rows(tmp_path / "traits.csv")
 
 
 def test_long_form(long: list[dict[str, str]]) -> None:
@@ -79,22 +74,22 @@ def test_units_and_accessions(long: list[dict[str, str]], tmp_path: Path) -> Non
                 "greenness_index": "UO:0000186"}  # fmt: skip
     assert {name: of_leaf[name]["unit_ontology"] for name in of_units} == of_units
     write_long(tmp_path / "unknown.csv", traits_of(unit=""))
-    assert {row["unit_ontology"] for row in read(tmp_path / "unknown.csv")} == {"", "UO:0000185", "UO:0000186"}
-    units = {row["trait"]: row["unit"] for row in read(tmp_path / "unknown.csv")}
+    assert {row["unit_ontology"] for row in read_rows(tmp_path / "unknown.csv")} == {"", "UO:0000185", "UO:0000186"}
+    units = {row["trait"]: row["unit"] for row in read_rows(tmp_path / "unknown.csv")}
     assert (units["area"], units["convex_hull_volume"]) == ("world unit^2", "world unit^3")
     write_wide(tmp_path / "wide.csv", traits_of(unit=""))
-    assert {row["unit"] for row in read(tmp_path / "wide.csv")} == {"world unit"}
+    assert {row["unit"] for row in read_rows(tmp_path / "wide.csv")} == {"world unit"}
 
 
 def test_wide_form(tmp_path: Path) -> None:
     write_wide(tmp_path / "wide.csv", traits_of())
-    first, second = read(tmp_path / "wide.csv")
+    first, second = read_rows(tmp_path / "wide.csv")
     begin = ["plant", "leaf", "use", "doubts", "area", "area_sd", "length", "length_sd", "width", "width_sd"]
     assert [*first][:12] == [*begin, "length_width_ratio", "length_width_ratio_sd"]
     assert [*first][-6:] == ["sure_views", "iou", "unit", "method", "quality", "probability"]
     leaves = traits_of().leaves[0], replace(traits_of().leaves[1], probability=0.75)
     write_wide(tmp_path / "chosen.csv", traits_of(leaves=leaves))
-    assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
+    assert [row["probability"] for row in read_rows(tmp_path / "chosen.csv")] == ["", "0.75"]
     assert (first["leaf"], first["use"], first["doubts"], first["quality"]) == ("1", "yes", "", "good")
     assert (second["leaf"], second["use"], second["doubts"]) == ("2", "no", "first; second")
     assert second["quality"] == traits_of().leaves[1].quality
@@ -114,7 +109,7 @@ def test_no_text_is_a_formula(text: str, tmp_path: Path) -> None:
     traits = traits_of(plant=text, unit=text, leaves=(leaf,), whole={"number_of_leaves": missing(text)})
     write_long(tmp_path / "long.csv", traits)
     write_wide(tmp_path / "wide.csv", traits)
-    for row in read(tmp_path / "long.csv") + read(tmp_path / "wide.csv"):
+    for row in read_rows(tmp_path / "long.csv") + read_rows(tmp_path / "wide.csv"):
         for cell in row.values():
             if cell.startswith(("=", "+", "-", "@", "\t", "\r")):
                 float(cell)  # a number stays one, with its sign

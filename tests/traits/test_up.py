@@ -37,9 +37,6 @@ def test_some_roll_is_evened_out() -> None:
     rolls = [3.0, -2.0, 1.0, -3.0, 2.0, -1.0, 2.0, -2.0]
     up = up_of_cameras(rolled(ring_cameras(8), rolls))
     assert np.degrees(np.arccos(up[2])) < 2
-
-
-def test_two_photos_across_each_other_are_enough() -> None:
     assert up_of_cameras(ring_cameras(4)[[0, 1]])[2] == pytest.approx(1)
 
 

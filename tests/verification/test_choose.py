@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -89,16 +90,13 @@ def same_partition(leaves: Leaves, truth: list[np.ndarray] = TRUE) -> bool:
     return len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
 
 
-def test_right_masks_are_chosen_as_they_are() -> None:
+def test_right_masks_are_chosen_as_they_are_and_views_agree_less_where_half_lack() -> None:
     leaves = choose(matched_of(PROPOSALS, IDS))
     assert same_partition(leaves)
     assert len(leaves.masks) == len(REGIONS)
     assert all(chance > 0.9 for chance in leaves.probabilities.values())
     assert leaves.surfaces.keys() == {1, 2, 3}
     assert leaves.agreement > 0.9
-
-
-def test_views_agree_less_about_a_leaf_that_half_of_them_lack() -> None:
     rows = ((IDS != 1) | (REGIONS.view_index % 2 == 0)).nonzero()[:, 0]
     proposals = proposals_of(REGIONS.select(rows), torch.full((len(rows),), 0.8))
     leaves = choose(matched_of(proposals, IDS[rows]), proposals, fit=lambda *_: LEAVES)
@@ -262,11 +260,9 @@ def test_a_mask_that_the_user_keeps_apart_from_a_leaf_does_not_return_to_it() ->
 def test_proposals_under_a_mask_of_the_user_go() -> None:
     """The user draws half of a leaf, which is matched to nothing."""
     row = int(((REGIONS.view_index == 2) & (IDS == 2)).nonzero()[0, 0])
-    half = [
-        np.where((labels == 2) & (np.arange(SIZE) < REGIONS.boxes[row, 0::2].float().mean().item()), 1, 0)
-        for labels in TRUE
-    ]
-    drawn = drawn_by_the_user([each * (view == 2) for view, each in enumerate(half)])
+    is_left = np.arange(SIZE) < REGIONS.boxes[row, 0::2].float().mean().item()
+    half = [np.where((labels == 2) & is_left & (view == 2), 1, 0) for view, labels in enumerate(TRUE)]
+    drawn = drawn_by_the_user(half)
     matched = matched_of(PROPOSALS, IDS)
     rest = matched.select(torch.arange(len(IDS)) != row)
     leaves = choose(matched, edited=edit(Masks.concatenate((rest, drawn)), gone=[row]))
@@ -274,7 +270,7 @@ def test_proposals_under_a_mask_of_the_user_go() -> None:
     assert int(here.areas.sum()) == int((here.label_map(2, torch.ones(len(here)), (SIZE, SIZE)) > 0).sum())
 
 
-def test_the_order_of_masks_does_not_matter() -> None:
+def test_the_order_of_masks_does_not_matter_and_classes_are_never_mixed() -> None:
     order = torch.randperm(len(REGIONS), generator=torch.Generator().manual_seed(0))
     proposals = proposals_of(REGIONS.select(order), torch.full((len(REGIONS),), 0.8))
     global TRUTH
@@ -283,9 +279,6 @@ def test_the_order_of_masks_does_not_matter() -> None:
         assert same_partition(choose(matched_of(proposals, IDS[order]), proposals))
     finally:
         TRUTH = IDS
-
-
-def test_classes_are_never_mixed() -> None:
     other = (REGIONS.view_index == 3) & (IDS == 1)
     proposals = replace(PROPOSALS, classes=torch.where(other, 2, 1))
     ids = torch.where(other, -1, IDS)
@@ -300,7 +293,10 @@ def test_a_probability_of_ones_own() -> None:
     assert same_partition(choose(matched, min_probability=0.0))
 
 
-def test_without_surfaces_matching_and_scores_decide() -> None:
+def test_without_surfaces_matching_and_scores_decide_and_nothing_is_an_answer() -> None:
+    empty = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
+    assert len(choose(empty, empty).masks) == 0
+    assert len(choose(matched_of(PROPOSALS, -torch.ones_like(IDS))).masks) == 0
     leaves = choose(matched_of(PROPOSALS, IDS), fit=lambda *_: {})
     assert same_partition(leaves)
     assert leaves.surfaces == {}
@@ -339,12 +335,6 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
     assert leaves.masks.num_instances == 3 - is_stem_told
 
 
-def test_nothing_is_an_answer() -> None:
-    empty = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
-    assert len(choose(empty, empty).masks) == 0
-    assert len(choose(matched_of(PROPOSALS, -torch.ones_like(IDS))).masks) == 0
-
-
 def test_the_best_expected_f1() -> None:
     """Against all thresholds, plainly."""
     rng = np.random.default_rng(0)
@@ -359,8 +349,6 @@ def test_the_best_expected_f1() -> None:
 
 def test_assignment_is_the_best_one_per_view() -> None:
     """Against every permutation, where no two masks show the same."""
-    from itertools import permutations
-
     drawn = draw_views(REGIONS, [None] * 3, CAMERAS)
     q = np.random.default_rng(1).uniform(0.3, 1, (len(REGIONS), 3)).round(4)
     leaf, shown = assign_masks(q, drawn)

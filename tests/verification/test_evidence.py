@@ -29,7 +29,6 @@ def frames(hides: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         for k, surface in enumerate(SURFACES):
             if surface is not None:
                 covered[view, k] = surface.project(CAMERAS[[view]])[0].numpy()
-                nearer = [covered[view, other] for other in depth if hides[other] and depth[other] < depth[k]]
                 nearer = [SURFACES[other].project(CAMERAS[[view]])[0].numpy() for other in depth
                           if hides[other] and depth[other] < depth[k]]  # fmt: skip
                 seen[view, k] = covered[view, k] & ~np.any([*nearer, np.zeros((SIZE, SIZE), bool)], 0)

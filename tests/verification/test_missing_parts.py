@@ -65,9 +65,6 @@ def test_tips_that_most_masks_lack_are_found_and_taken() -> None:
     for view in (0, 1, 2, 3):
         assert max(before[view], bare[view]) < 0.9
         assert after[view] > 0.95
-
-
-def test_a_tip_that_few_masks_lack_is_left() -> None:
     missing = find_missing_parts(cut_tips((0, 1)), LEAVES, paint, cameras=CAMERAS)
     assert missing == [None] * len(missing)
 

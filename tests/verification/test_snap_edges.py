@@ -70,15 +70,13 @@ def test_a_mirrored_photo_has_the_mirrored_mask(flip: tuple[slice, ...]) -> None
 
 
 def test_no_edge_moves_farther_than_the_band() -> None:
+    """It is three pixels of a mask of sixty: where the leaf is larger than its mask (root of the area: 62), the edge
+    moves so far and no farther."""
     leaf = ellipse()
     found = grown(leaf, -9)  # the photo says that the leaf is much larger
     new, reach = snap(found, paint(leaf.astype(int)), others=NOTHING), round(SNAP.band * np.sqrt(found.sum()))
     assert (new & ~grown(found, reach)).sum() == 0
     assert (grown(found, -reach) & ~new).sum() == 0
-
-
-def test_the_band_is_three_pixels_of_a_mask_of_sixty() -> None:
-    """Where the leaf is larger than its mask (root of the area: 62), the edge moves so far and no farther."""
     found = ellipse()
     new = snap(found, paint(grown(found, 4).astype(int)), others=NOTHING)
     assert not (new & ~grown(found, 3)).any()

@@ -55,7 +55,7 @@ def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regi
                 content = _read(view, None if scene is None else tuple(scene.cameras.sizes[index].tolist()))
             yield content
 
-    return stack_views(contents(), scene, num_views=len(views), source="masks in memory")
+    return stack_views(contents(), scene, source="masks in memory")
 
 
 @check_arguments

@@ -35,6 +35,14 @@ COMPLETE = ("NumPy arrays", "cellpose", CELLPOSE, "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)
 Files = tuple[tuple[Path, ...], ...]  # of each view
 EXPECTED = "expected a folder of label PNGs or a COCO .json file, or another kind of docs/formats.md"
+JPEG = "is a JPEG, which blurs the numbers of masks: export PNG instead"
+# Files that hold masks in a form that is not read, and what to do.
+REFUSED = {
+    ".xml": "is XML, expected CVAT's export 'COCO 1.0' or 'Segmentation mask 1.1'",
+    ".npz": "is an archive of arrays, expected one array: np.save writes it as .npy",
+    ".jpg": JPEG,
+    ".jpeg": JPEG,
+}
 
 
 @dataclass(frozen=True)
@@ -64,11 +72,10 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     """
     if masks.is_file() and masks.suffix.lower() == ".json":
         return MaskFiles(masks, "COCO", ((masks,),) * len(scene.views))
-    if masks.is_file() and masks.suffix.lower() == ".xml":
-        _refuse_cvat(masks)
+    if masks.is_file():
+        raise InputError(f"{masks}: {REFUSED.get(masks.suffix.lower(), f'not a known kind of masks, {EXPECTED}')}")
     if not masks.is_dir():
-        what = "not a known kind of masks" if masks.is_file() else "no such masks"
-        raise InputError(f"{masks}: {what}, {EXPECTED}")
+        raise InputError(f"{masks}: no such masks, {EXPECTED}")
     folder = masks / "SegmentationObject" if (masks / "SegmentationObject").is_dir() else masks  # VOC
     paths = _list_files(folder, scene)
     groups = _group(folder, paths)
@@ -91,12 +98,6 @@ def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     find_views([f"{name}.png" for name in groups[kind]], scene, source=folder, warn_of_loose=True)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
-
-
-def _refuse_cvat(path: Path) -> None:
-    with path.open("rb") as file:
-        if b"<annotations" in file.read(1 << 12):
-            raise InputError(f"{path}: is CVAT's XML, expected its export 'COCO 1.0' or 'Segmentation mask 1.1'")
 
 
 def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
@@ -172,11 +173,7 @@ def _name_kind(kind: str, files: Files) -> str:
     if kind != "JSON":
         return "label images" if kind == CELLPOSE else kind
     first = next(paths[0] for paths in files if paths)
-    try:
-        data = first.read_bytes()
-    except OSError as error:
-        raise InputError(f"{first}: cannot be read ({error.strerror})") from None
-    return "labelme" if b'"shapes"' in data else "SAM"
+    return "labelme" if b'"shapes"' in first.read_bytes() else "SAM"
 
 
 def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:
@@ -186,18 +183,12 @@ def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tupl
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
     if unclear:
         raise InputError(f"{masks}: {unclear[0]}")
-    for path in paths:
-        if path.suffix.lower() == ".xml":
-            _refuse_cvat(path)
     listed = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
     if jsons:
         message = f"holds {len(jsons)} JSON files ({listed}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
-    archive = next((path for path in paths if path.suffix.lower() == ".npz"), None)
-    if archive is not None:
-        raise InputError(f"{archive}: is an archive of arrays, expected one array: np.save writes it as .npy")
-    jpeg = next((path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")), None)
-    if jpeg is not None:
-        raise InputError(f"{jpeg}: is a JPEG, which blurs the numbers of masks: export PNG instead")
+    for path in paths:
+        if reason := REFUSED.get(path.suffix.lower()):
+            raise InputError(f"{path}: {reason}")
     expected = f"masks named {scene.views[0].name}.png or {scene.views[0].name}.json"
     raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {listed}")

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from mvseg.crop import Box, Crop
+from mvseg.crop import Crop
 from mvseg.errors import InputError, warn
 from mvseg.findings.finding import Finding, Rule, list_findings
 from mvseg.formats.lens import undistort
@@ -21,12 +21,9 @@ SAME = 0.75  # definition: IoU of two masks of one object; that of 20 x 8 pixels
 COVERS = 0.8  # chosen: of the photo: the background
 INSIDE = 0.9  # chosen: share of a mask that lies in a larger one, from which it is a part of that
 MANY = 0.2  # chosen: share of the masks that are such parts, above which they are no leaves that hide each other
-Cropped = tuple[int, Box | None, np.ndarray]  # number, box (None: no pixel), and the pixels (h, w) bool in the box
 
 
-def stack_views(
-    views: Iterable[ViewMasks], scene: Scene | None, *, source: object, num_views: int | None = None
-) -> Regions:
+def stack_views(views: Iterable[ViewMasks], scene: Scene | None, *, source: object) -> Regions:
     """The regions of all views, with the lens distortion of the scene removed; one mask is in memory at a time, if the
     views are iterators.
 
@@ -34,18 +31,17 @@ def stack_views(
         views: V times a label map (H, W) uint16 (0 = nothing, 65535 = ignore), or pairs of a number and a mask (H, W)
             bool, which may overlap; in the frame of the photo.
         scene: gives the lenses; None for masks of undistorted photos.
-        num_views: V, if there is no scene.
 
     Returns:
         Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks that are left out: those
         without pixels, empty or not shown by the undistorted photo, and those that stand twice in one view, or nearly
-        (`SAME`), and of findings of `check_numbers` in label maps and of `mask_faults` in masks of a scene.
+        (`SAME`); and of findings of `check_numbers` in label maps and of `mask_faults` in masks of a scene.
 
     Raises:
         InputError: there are masks, and none has a pixel; or see `check_numbers`. Messages name `source`.
     """
     rows: list[tuple[int, Crop, int]] = []
-    between, num_empty, num_twice = np.zeros(2, np.int64), 0, 0
+    between, num_views, num_empty = np.zeros(2, np.int64), 0, 0
     for view, content in enumerate(views):
         lens = None if scene is None else scene.views[view].lens
         K = np.eye(3) if scene is None else scene.cameras.K[view].cpu().numpy()
@@ -53,18 +49,18 @@ def stack_views(
             between += count_between(content)
             parts = _crop_labels(content, lens, K)
         else:
-            parts = _crop_masks(content, lens, K)
-        earlier: set[tuple[Box, bytes]] = set()
-        for label, box, crop in parts:
-            if box is None:
-                num_empty += 1
-            elif (key := (box, np.packbits(crop).tobytes())) in earlier:
-                num_twice += 1
+            parts = ((label, Crop.of(undistort(mask.view(np.uint8), lens, K).view(bool))) for label, mask in content)
+        for label, crop in parts:
+            if crop.pixels.any():
+                rows.append((view, crop, label))
             else:
-                earlier.add(key)
-                rows.append((view, Crop(box, torch.from_numpy(crop)), label))
-    _say_left_out(len(rows), num_empty, num_twice, source=source)
-    num_views = num_views or 0 if scene is None else len(scene.views)
+                num_empty += 1
+        num_views += 1
+    if num_empty and not rows:
+        what = f"{num_empty} masks show no pixel (empty, or outside of the undistorted photo)"
+        raise InputError(f"{source}: {what}, and no others are there")
+    if num_empty:
+        warn(Finding("masks_without_pixels", str(source), {"count": num_empty}))
     regions = _without_copies(stack_regions(rows, num_views), source=source)
     if between[0]:
         check_numbers(regions, between, source=source)
@@ -75,21 +71,13 @@ def stack_views(
     return regions
 
 
-def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
+def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[tuple[int, Crop]]:
+    """The numbers of a label map; a crop without a pixel where the undistorted photo does not show one."""
     label_map = undistort(labels, lens, K)
     boxes = label_boxes(label_map)
     for number in boxes if lens is None else label_boxes(labels):
-        x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 0, 0))
-        yield number, box if number in boxes else None, label_map[y1:y2, x1:x2] == number
-
-
-def _crop_masks(
-    masks: Iterable[tuple[int, np.ndarray]], lens: pycolmap.Camera | None, K: np.ndarray
-) -> Iterator[Cropped]:
-    for label, mask in masks:
-        shown = undistort(mask.view(np.uint8), lens, K).view(bool)
-        crop = Crop.of(shown) if shown.any() else None
-        yield (label, None, shown) if crop is None else (label, crop.box, crop.pixels.numpy())
+        x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 1, 1))
+        yield number, Crop(box, torch.from_numpy(label_map[y1:y2, x1:x2] == number))
 
 
 def _without_copies(regions: Regions, *, source: object) -> Regions:
@@ -100,16 +88,6 @@ def _without_copies(regions: Regions, *, source: object) -> Regions:
     if is_copy.any():
         warn(Finding("copies", str(source), {"count": int(is_copy.sum()), "total": len(regions), "iou": SAME}))
     return regions.select(~is_copy)
-
-
-def _say_left_out(num_kept: int, num_empty: int, num_twice: int, *, source: object) -> None:
-    if num_empty:
-        if not num_kept:
-            what = f"{num_empty} masks show no pixel (empty, or outside of the undistorted photo)"
-            raise InputError(f"{source}: {what}, and no others are there")
-        warn(Finding("masks_without_pixels", str(source), {"count": num_empty}))
-    if num_twice:
-        warn(Finding("masks_twice", str(source), {"count": num_twice, "total": num_kept + num_twice}))
 
 
 def mask_faults(regions: Regions, sizes: Sequence[Sequence[int]]) -> list[Rule]:

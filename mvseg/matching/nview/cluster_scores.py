@@ -20,7 +20,7 @@ from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_
 from mvseg.matching.partition import Clusters, members_of
 from mvseg.matching.view_graph import ViewGraph
 
-# fitted: python benchmarks/pair_odds.py --cache DIR: log odds that two regions show one instance, by epipolar weight.
+# fitted: python -m benchmarks.pair_odds --cache DIR: log odds that two regions show one instance, by epipolar weight.
 # What it counts today is within 0.5 of these.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
 # fitted: the same

@@ -31,7 +31,7 @@ from mvseg.scene import Cameras
 # Several masks of one photo in one cluster are pieces of one leaf, or a leaf and a stranger: a leaf that only one photo
 # shows fits another leaf along its rays. So a second mask of one photo must be as likely a piece as this scene's masks
 # are in pieces, and explained by the cluster nearly as well as the first.
-# fitted: python benchmarks/pieces.py: weights of the columns of `piece_features`, in their order.
+# fitted: python -m benchmarks.pieces: weights of the columns of `piece_features`, in their order.
 PIECE = {"always": 1.28, "other pieces": 0.84, "score": 3.69, "coverage": 4.37, "weight": -3.93}
 
 

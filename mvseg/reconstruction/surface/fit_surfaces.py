@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.find_starts import area_cost, find_starts, wid
 from mvseg.reconstruction.surface.fit_patch import PatchFit, fit_patches
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, Quality, measure_sizes
+from mvseg.reconstruction.surface.leaf_surface import ByInstance, LeafSurface, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, join_stacks, stack_masks
 from mvseg.reconstruction.surface.occupancy import occupy_surface, unshown_share
@@ -69,7 +69,7 @@ def fit_surfaces(
 
     Returns:
         {instance id: surface} for every instance. Where no surface can be fitted (one view, masks that agree on no
-        point) its coefficients are NaN and its `quality` says why.
+        point) its coefficients are NaN and its `reasons` say why.
 
     Raises:
         InputError: as many ids as regions are expected; a worker was killed.
@@ -82,7 +82,7 @@ def fit_surfaces(
     frames = instance_frames(regions, instance_ids, cameras)
     surfaces: dict[int, LeafSurface] = {}
     asked: dict[int, _Asked] = {}
-    for instance in _ids(instance_ids):
+    for instance in instance_ids[instance_ids > 0].unique().tolist():
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
         if len(views) < 2:
@@ -105,7 +105,7 @@ def fit_surfaces(
         _fit_new(cache, {each.name: each for each in again.values()}, _fit_again, workers)
     for instance, each in asked.items():
         nothing = LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
-        surfaces[instance] = cache[names[instance]] if instance in names else nothing
+        surfaces[instance] = cache.get(names.get(instance, "")) or nothing
     oriented = orient_surfaces(dict(sorted(surfaces.items())), cameras)
     return ByInstance((n, reuse_object(cache, names[n], each) if n in names else each) for n, each in oriented.items())
 
@@ -163,10 +163,6 @@ def _ask_again(
     return again
 
 
-def _ids(instance_ids: Tensor) -> list[int]:
-    return instance_ids[instance_ids > 0].unique().tolist()
-
-
 def instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
     """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
     last = int(instance_ids.max()) if len(instance_ids) else 0
@@ -175,13 +171,9 @@ def instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) ->
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface]:
-    return [
-        LeafSurface.none(torch.from_numpy(each.masks.views), "no_common_point", "its masks agree on no point")
-        if fit is None
-        else _surface(masks, fit, offsets=fit.offsets_px)
-        for each, (masks, fit) in zip(asked, _approach(asked, is_rough=True), strict=True)
-    ]
+def _fit_roughly(asked: Sequence[_Asked]) -> list[LeafSurface | None]:
+    fits = _approach(asked, is_rough=True)
+    return [None if fit is None else _surface(masks, fit, offsets=fit.offsets_px) for masks, fit in fits]
 
 
 def _fit_first(asked: Sequence[_Asked]) -> list[Approach | None]:
@@ -259,7 +251,7 @@ def _fit_again(asked: Sequence[_AskedAgain]) -> list[LeafSurface]:
             points = patch_grid(*FIT.grid).points(fit.coefficients)
             unshown = unshown_share(masks, points)
             surface = occupy_surface(surface, each.masks, hidden=masks, unshown=unshown)
-            surface = replace(surface, quality=Quality(_judge(surface, unshown) | _judge_ends(points)))
+            surface = replace(surface, reasons=_judge(surface, unshown) | _judge_ends(points))
         surfaces.append(surface)
     return surfaces
 
@@ -275,7 +267,7 @@ def _surface(masks: MaskStack, fit: PatchFit, *, offsets: Floats) -> LeafSurface
         residual_px=torch.from_numpy(fit.residual_px * masks.pixel_size),
         iou=torch.from_numpy(view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))),
         is_oriented=False,
-        quality=Quality(),
+        reasons={},
         offsets_px=torch.from_numpy(offsets),
     )
     # Where other fits are as good, all deviations are larger by as much as that of the area is.

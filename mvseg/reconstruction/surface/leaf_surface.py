@@ -33,18 +33,6 @@ T = TypeVar("T")
 MESH_SHAPE = (64, 17)  # definition: a mesh has so many rows and columns of vertices
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Is the surface to be trusted? `reasons` {code: sentence} to doubt it, the gravest first; empty for a good one."""
-
-    reasons: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def is_good(self) -> bool:
-        """Whether there is no reason to doubt it."""
-        return not self.reasons
-
-
 @dataclass(frozen=True, eq=False)
 class Occupancy:
     """Cells of a sheet that its leaf covers.
@@ -89,7 +77,7 @@ class LeafSurface:
         iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it, of the surface
             drawn as much too large or small as the mask seems to be; NaN where the fit did not get that far.
         is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
-        quality: good, or the reasons to doubt it.
+        reasons: {code: sentence} to doubt it, the gravest first; empty for a good one.
         offsets_px: (S,) float64, how much too large its masks were for its first fit, in pixels of that: all masks of a
             scene tell how they err. (0,) where that is not known: of a surface that was read from a file.
         occupancy: where on the surface the leaf is; None: everywhere.
@@ -101,13 +89,13 @@ class LeafSurface:
     residual_px: Tensor
     iou: Tensor
     is_oriented: bool
-    quality: Quality
+    reasons: Mapping[str, str]
     offsets_px: Tensor = field(default_factory=partial(torch.zeros, 0, dtype=torch.float64))
     occupancy: Occupancy | None = None
     _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
-        why = "; ".join(self.quality.reasons.values()) or "good"
+        why = "; ".join(self.reasons.values()) or "good"
         sizes = f"area {self.area:.4g}, length {self.length:.4g}, {len(self.views)} views; " if self.exists else ""
         return f"LeafSurface({sizes}{why})"
 
@@ -126,7 +114,7 @@ class LeafSurface:
             residual_px=nothing,
             iou=nothing,
             is_oriented=False,
-            quality=Quality({code: reason}),
+            reasons={code: reason},
         )
 
     @property
@@ -247,13 +235,10 @@ class LeafSurface:
         for view, size in enumerate(sizes):
             is_ahead = (grid_quads(depth[view].reshape(*points.shape[:2], 1).numpy()) > 0).all((1, 2))
             quads = grid_quads(px[view].reshape(*points.shape[:2], 2).numpy())[is_ahead & is_leaf]
-            if not len(quads):
-                parts.append(nothing)
-                continue
-            low = np.clip(np.floor(quads.min((0, 1))), 0, size).astype(int)
-            high = np.clip(np.ceil(quads.max((0, 1))), 0, size).astype(int)
+            low = np.clip(np.floor(quads.min((0, 1), initial=np.inf)), 0, size).astype(int)
+            high = np.clip(np.ceil(quads.max((0, 1), initial=-np.inf)), 0, size).astype(int)
             (width, height), corner = (high - low).tolist(), low.astype(float)
-            if width == 0 or height == 0:
+            if width <= 0 or height <= 0:
                 parts.append(nothing)
                 continue
             shown = torch.from_numpy(draw_polygons(quads, (width, height), corner) >= 0.5)

@@ -35,15 +35,12 @@ def test_a_number_per_class_is_warned_of(kind: str, tmp_path: Path) -> None:
         assert len(load_masks(load_scene(folder), folder / "masks")) == 8
 
 
-def test_pieces_in_few_photos_are_no_classes(tmp_path: Path) -> None:
+def test_pieces_in_few_photos_are_no_classes_and_a_photo_no_label_image(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     for name in ("000.png", "001.png"):
         write_label_png(folder / "masks" / name, CLASSES)
     assert len(load_masks(load_scene(folder), folder / "masks")) == 10  # warnings are errors
-
-
-def test_a_photo_is_no_label_image(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "plant")
+    folder = write_scene(tmp_path / "other")
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH), np.uint8)
     write_image(folder / "masks" / "002.png", noise)
     with pytest.raises(InputError, match=r"masks: the label image of view 2 holds 25\d numbers .* is it a photo\?"):

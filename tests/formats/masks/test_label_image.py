@@ -72,15 +72,12 @@ def test_255_is_a_border_where_it_surrounds_the_others(is_border: bool) -> None:
     np.testing.assert_array_equal(labels, np.where(before == 255, 65535, before) if is_border else before)
 
 
-def test_what_is_transparent_is_nothing(tmp_path: Path) -> None:
+def test_what_is_transparent_is_nothing_and_large_numbers_are_renumbered(tmp_path: Path) -> None:
     pixels = np.zeros((2, 3, 4), np.uint8)
     pixels[..., 0], pixels[:, 1:, 3] = 200, 255
     Image.fromarray(pixels).save(tmp_path / "cut.png")
     assert read_label_image(tmp_path / "cut.png", 3, 2).tolist() == [[0, 1, 1]] * 2
     assert read_mask_images([tmp_path / "cut.png"], 3, 2)[0].mask.tolist() == [[False, True, True]] * 2
-
-
-def test_large_numbers_are_renumbered(tmp_path: Path) -> None:
     Image.fromarray(np.array([[0, 70000], [70000, 2**31 - 1]], np.int32)).save(tmp_path / "ids.tif")
     assert read_label_image(tmp_path / "ids.tif", 2, 2).tolist() == [[0, 1], [1, 2]]
 

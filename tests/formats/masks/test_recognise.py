@@ -226,9 +226,9 @@ def test_what_is_there_is_said(folder: Path) -> None:
     (folder / "other").mkdir()
     with pytest.raises(InputError, match=r"other: fits no photo of the scene, expected .* found nothing"):
         load_masks(scene, folder / "other")
-    for name in ("a.png", "b.png", "c.xml", "d.xml"):
+    for name in ("a.png", "b.png", "c.md", "d.md"):
         (folder / "other" / name).touch()
-    with pytest.raises(InputError, match=r"found a.png, b.png, c.xml and 1 more"):
+    with pytest.raises(InputError, match=r"found a.png, b.png, c.md and 1 more"):
         load_masks(scene, folder / "other")
     with pytest.raises(InputError, match=r"000.png: not a known kind of masks, expected a folder"):
         load_masks(scene, folder / "masks" / "000.png")
@@ -278,13 +278,10 @@ def test_entries_that_are_all_boxes_are_no_masks(folder: Path) -> None:
         load_masks(scene, masks)
 
 
-def test_the_background_as_a_leaf_is_said(folder: Path) -> None:
+def test_the_background_as_a_leaf_is_said_and_label_images_have_no_categories(folder: Path) -> None:
     """`mvseg check` calls it an error."""
     masks = write_masks(folder, lambda path, labels: write_image(Path(f"{path}.png"), labels + 1))
     with warns_of("background_mask"):
         assert len(load_masks(load_scene(folder), masks)) == 16
-
-
-def test_label_images_have_no_categories(folder: Path) -> None:
     with pytest.raises(InputError, match=r"masks: holds label images, which have no categories to select from"):
         load_masks(load_scene(folder), folder / "masks", categories=["leaf"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,19 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from csv_rows import read_rows
 from mvseg.results.result import Instances, Result
-from report_browser import CHROMIUM, OPTIONS, WAIT_MS, Opened, sync_api
+from report_browser import CHROMIUM, OPTIONS, Opened, browser_with, sync_api
 from report_pages import HOSTILE, rename_hostile, write_page
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[sync_api.Browser]:
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=OPTIONS, timeout=WAIT_MS)
-        yield browser
-        browser.close()
+browser = browser_with(*OPTIONS)
 
 
 @pytest.fixture(scope="module")
@@ -181,8 +176,7 @@ def test_columns_are_chosen_and_saved_as_csv(opened: Viewer, balls: Result) -> N
     opened.page.locator("#table th", has_text="leaf").first.locator("button").click()  # the last one first
     with opened.page.expect_download() as download:
         opened.page.locator("#save-table").click()
-    with Path(download.value.path()).open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = read_rows(Path(download.value.path()))
     assert {"num_pieces", "x_max"}.isdisjoint(rows[0])
     assert [row["leaf"] for row in rows] == ["3", "2", "1"]
     assert {(row["plant"], row["unit"]) for row in rows} == {(f"plant {HOSTILE}", f"mm {HOSTILE}")}
