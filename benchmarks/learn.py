@@ -4,7 +4,7 @@ For each scene a table: as it is; after one, two, three rounds (each from the la
 area says); and after one round in which a person has outlined six leaves in two photos each, the largest ones that are
 not right; these outlines do not count in the figures. The agreed area (`rate_pass`, in percent of all pixels) stands
 beside what the truth says, where the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep:
-see `choose_rating`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
+see `order_ratings`. With --table, one row for each scene, as `mvseg infer` finds it; of the false leaves it says how
 many are stems (`stem_chances`), E is the expected number of correct masks, and the spread of MV-PQ is the standard
 deviation over --worlds, that of the row and turned ones (`spread.py`). Weights and detections are kept in --cache.
 """
@@ -42,7 +42,7 @@ from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.traits.filters import SURELY_STEM
-from mvseg.verification.leaf_scores import choose_rating
+from mvseg.verification.leaf_scores import order_ratings
 
 DRAWN, PHOTOS = 6, 2  # leaves that the person outlines, and in how many photos each
 TABLE = (
@@ -146,7 +146,7 @@ def main() -> None:
             begun, before = time.process_time(), plant
             plant = learn(plant, cache=cache, rounds=1)
             after = replace(plant, colors=before.leaf_colors).rating
-            stays = stays and choose_rating([before.rating, after]) == 1
+            stays = stays and order_ratings([before.rating, after])[0] == 1
             name = f"round {number}, at {plant.image_size} px"
             show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
         if args.person and truth is not None:

@@ -2,7 +2,7 @@
 
 The detector looks at every size down to 32 px, and no search ends early. With --cut, once more at copies of the photos
 of which a third is cut off on each side, so that the plant fills and leaves them. For each scene a table of its sizes,
-with what decides (`choose_rating`) beside MV-PQ, edges as the detector drew them; at the end, how many pairs of sizes
+with what decides (`order_ratings`) beside MV-PQ, edges as the detector drew them; at the end, how many pairs of sizes
 whose MV-PQ differs by 0.02 the agreed area orders, and how much of the best MV-PQ is lost by the best size over the
 whole range, and by that which `choose_size` stops at. Detections are kept in --cache.
 """
@@ -29,7 +29,7 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.pipeline.find_in_photos import choose_size, colors_to_judge_by, run_pass, select_judges
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
-from mvseg.verification.leaf_scores import choose_rating
+from mvseg.verification.leaf_scores import order_ratings
 
 
 def cut_photos(folder: Path, out: Path) -> Path:
@@ -78,8 +78,8 @@ def sweep(folder: Path, cache: Path) -> tuple[float, float]:
     while (size := results[0].image_size * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
         results.append(see(round(size)))
     by_size = {round(results[0].image_size * DETECTION.size_step**n): each for n, each in enumerate(results)}
-    best = results[choose_rating([each.rating for each in results])]
-    searched = choose_size(by_size.__getitem__, results[0])
+    best = results[order_ratings([each.rating for each in results])[0]]
+    searched = choose_size(by_size.__getitem__, results[0])[0]
     areas, values = np.array([(each.rating.agreed_area, scores[each.image_size]) for each in results]).T
     one, other = np.triu_indices(len(results), 1)
     differs = abs(values[one] - values[other]) >= 0.02

@@ -133,7 +133,7 @@ def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], mon
         return Leaves(proposals, surfaces={}, probabilities={}, rejected=(), keys={})
 
     monkeypatch.setattr("mvseg.pipeline.plant.choose_leaves", choose)
-    monkeypatch.setattr("mvseg.pipeline.find_in_photos.choose_size", lambda _, first: first)
+    monkeypatch.setattr("mvseg.pipeline.find_in_photos.choose_size", lambda _, first: [first])
     results = wrapped(photos, cameras=CAMERAS)
     with other_device() as device:
         answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))

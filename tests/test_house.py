@@ -120,8 +120,8 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 37_122, "benchmarks": 6_515, "tests": 32_863}
-SLACK, MOST_CODE = 400, 21_281
+BUDGET = {"mvseg": 37_160, "benchmarks": 6_515, "tests": 32_879}
+SLACK, MOST_CODE = 400, 21_308
 
 
 @pytest.mark.parametrize("place", BUDGET)
@@ -287,7 +287,7 @@ def test_numbers_of_a_room_stand_in_one_place() -> None:
     assert {module for module, names in heads.items() if names} == BESIDE
 
 
-MOST_NUMBERS, MOST_CHOSEN = 636, 328  # 550 and 200 are where they are to go
+MOST_NUMBERS, MOST_CHOSEN = 637, 329  # 550 and 200 are where they are to go
 WORDS = "definition", "limit", "fitted", "insensitive", "chosen"  # of numbers
 
 

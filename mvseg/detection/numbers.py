@@ -17,6 +17,7 @@ class DetectionNumbers:
     size_step: float = 0.5**0.5  # chosen: size of a look, as a share of the one before: half of the pixels
     # Of two muskmelons of three, eight of 20 views find the best size, in a third of the time (docs/notes/detector.md).
     judging_views: int = 8  # chosen: views that choose the size, where there are twice as many or more
+    as_good: float = 0.9  # chosen: min. agreed area of the second best size, in the best one; then all views see both
     clear_agreement: float = 0.84  # chosen: agreement from which one smaller size without growth ends the search
     patience: int = 2  # fitted: `python -m benchmarks.sizes SCENE... --cut`; the same below, sizes that do not end it
     brightest: float = 1.5  # limit: pixel value above which photos are not in [0, 1]; resampling may exceed 1

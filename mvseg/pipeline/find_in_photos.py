@@ -24,7 +24,7 @@ from mvseg.findings.finding import Finding
 from mvseg.pipeline.open_scene import Opened
 from mvseg.pipeline.plant import Plant, make_plant, whole_photos
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.verification.leaf_scores import choose_rating
+from mvseg.verification.leaf_scores import order_ratings
 from mvseg.verification.numbers import CHOICE, COLORS
 from mvseg.verification.picture import is_familiar
 
@@ -34,7 +34,7 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
 
     The detector looks at several sizes, see `choose_size`, unless one is given, or the views clearly agree about the
     leaves of a species that the detector knows. Of twice as many photos as `DETECTION.judging_views`, or more, so many
-    choose the size. All sizes are of the parts that the first pass chose.
+    choose the size, or the two between which all photos choose. All sizes are of the parts that the first pass chose.
     """
     size = opened.config.detect.image_size
     if size is not None or opened.holds:
@@ -43,18 +43,21 @@ def find_in_photos(opened: Opened, *, cache: CachedDetections | None = None) -> 
     first = run_pass(few, None, cache=cache)
     boxes, colors, cameras = first.boxes, colors_to_judge_by(first), opened.scene.cameras
     first = replace(first, colors=colors)
-    best, is_clear = first, first.agreement >= DETECTION.clear_agreement
+    best, is_clear = [first], first.agreement >= DETECTION.clear_agreement
     if not (is_clear and is_familiar(first.masks, sure_score=DETECTION.sure_score)):
         best = choose_size(partial(run_pass, few, cache=cache, boxes=boxes, colors=colors), first)
     if few is opened:
-        return announce(best)
+        return announce(best[0])
     if torch.equal(boxes, whole_photos(few.scene)):
         boxes = whole_photos(opened.scene)
     else:
         masks = first.matched["matched"]
         regions = replace(masks.regions, view_index=views[masks.view_index], num_views=len(cameras))
         boxes = plant_boxes(replace(masks, regions=regions), cameras)
-    return announce(run_pass(opened, None if best is first else best.image_size, cache=cache, boxes=boxes))
+    if best[0] is first:  # a species that the detector knows: no other size is worth a pass over all photos
+        return announce(run_pass(opened, None, cache=cache, boxes=boxes))
+    run = partial(run_pass, opened, cache=cache, boxes=boxes, colors=colors)
+    return announce(order_sizes([run(None if each is first else each.image_size) for each in best])[0])
 
 
 def announce(plant: Plant) -> Plant:
@@ -80,8 +83,9 @@ def select_judges(opened: Opened) -> tuple[Opened, Tensor]:
     return replace(opened, scene=scene, photos=opened.photos.select(scene, views.tolist())), views
 
 
-def choose_size(see: Callable[[int], Plant], first: Plant) -> Plant:
-    """Look again and again at a smaller size, as long as the agreed area grows; return the best pass.
+def choose_size(see: Callable[[int], Plant], first: Plant) -> list[Plant]:
+    """Look again and again at a smaller size, as long as the agreed area grows; return one pass, or two, see
+    `order_sizes`.
 
     Where the views do not clearly agree about the best leaves so far (`DETECTION.clear_agreement`), it takes more sizes
     without growth (`DETECTION.patience`): there, agreed areas of neighbouring sizes differ by chance.
@@ -92,25 +96,28 @@ def choose_size(see: Callable[[int], Plant], first: Plant) -> Plant:
     """
     results, size, num_misses = [first], float(first.image_size), 0
     while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
-        best = choose_pass(results)
+        best = order_sizes(results)[0]
         results.append(see(round(size)))
-        num_misses = 0 if choose_pass(results) is results[-1] else num_misses + 1
+        num_misses = 0 if order_sizes(results)[0] is results[-1] else num_misses + 1
         if num_misses > (0 if best.agreement >= DETECTION.clear_agreement else DETECTION.patience):
             break
-    return choose_pass(results)
+    return order_sizes(results)
 
 
-def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> Plant:
+def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> list[Plant]:
     """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
-    `most`: the longer side of the photos, pixels. Returns the best pass."""
+    `most`: the longer side of the photos, pixels. Returns as `choose_size`."""
     larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
     sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
-    return choose_pass([see(each) for each in sizes])
+    return order_sizes([see(each) for each in sizes])
 
 
-def choose_pass(results: Sequence[Plant]) -> Plant:
-    """The best one, see `choose_rating`."""
-    return results[choose_rating([each.rating for each in results])]
+def order_sizes(results: Sequence[Plant]) -> list[Plant]:
+    """The best pass, see `order_ratings`; then the next, if its agreed area is at least `DETECTION.as_good` times as
+    large, for the caller to decide between the two by all views."""
+    first, *others = [results[index] for index in order_ratings([each.rating for each in results])]
+    least = DETECTION.as_good * first.rating.agreed_area
+    return [first, *(each for each in others[:1] if each.rating.agreed_area >= least)]
 
 
 def run_near(plant: Plant, *, cache: CachedDetections | None) -> Plant:
@@ -121,8 +128,10 @@ def run_near(plant: Plant, *, cache: CachedDetections | None) -> Plant:
         return run_pass(opened, size, cache=cache, boxes=boxes)
     few, views = select_judges(opened)
     run = partial(run_pass, cache=cache, colors=plant.leaf_colors)
-    best = choose_near(partial(run, few, boxes=boxes[views]), plant.image_size, most=plant.longest_side)
-    return best if few is opened else run(opened, best.image_size, boxes=boxes)
+    results = choose_near(partial(run, few, boxes=boxes[views]), plant.image_size, most=plant.longest_side)
+    if few is opened:
+        return results[0]
+    return order_sizes([run(opened, each.image_size, boxes=boxes) for each in results])[0]
 
 
 def run_pass(

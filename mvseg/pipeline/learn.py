@@ -34,7 +34,7 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import report_step, timed
 from mvseg.training.fine_tune import STEPS, fine_tune
 from mvseg.training.view_labels import ViewLabels, label_views
-from mvseg.verification.leaf_scores import choose_rating
+from mvseg.verification.leaf_scores import order_ratings
 from mvseg.verification.numbers import CHOICE
 from mvseg.verification.picture import is_familiar
 
@@ -73,7 +73,7 @@ def learn(
             taught = _learn_once(best, labels, cache)
             before, after = best.rating, replace(taught, colors=best.leaf_colors).rating
             areas.append(after.agreed_area)
-            if rounds is None and choose_rating([before, after]) == 0:
+            if rounds is None and order_ratings([before, after])[0] == 0:
                 break
             best = replace(taught, learned=replace(taught.learned, rounds=number))
     except KeyboardInterrupt:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -36,12 +37,18 @@ class Association:
 
 
 def link_leaves(
-    counts: Sequence[int], costs: Mapping[tuple[int, int], Floats], *, same: Asked = (), different: Asked = ()
+    counts: Sequence[int],
+    costs: Mapping[tuple[int, int], Floats],
+    *,
+    same: Asked = (),
+    different: Asked = (),
+    doubted: np.ndarray | None = None,
 ) -> list[Association]:
     """The links of the cheapest tracks, by their earlier observation.
 
     `counts` are the leaves with a shape on each date; `same` and `different` pairs of observations that the user says
-    are one leaf, or are not. Raises InputError: the pairs contradict each other.
+    are one leaf, or are not; `doubted` (S,) bool, of all dates one after the other, those that look like a stem, see
+    `join_observations`. Raises InputError: the pairs contradict each other.
     """
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     date_of, gains = np.repeat(np.arange(len(counts)), counts), np.zeros((starts[-1], starts[-1]))
@@ -52,7 +59,9 @@ def link_leaves(
     for place, gain in asked.items():
         gains[place] = gain
     gains += gains.T
-    tracks = join_observations(gains, date_of)
+    is_late = np.zeros(len(gains), bool) if doubted is None else doubted.copy()
+    is_late[[*chain(*asked)]] = False
+    tracks = join_observations(gains, date_of, is_late)
     if any((tracks[one] == tracks[other]) != (gain > 0) for (one, other), gain in asked.items()):
         raise InputError("what the user says of leaves over days contradicts itself")
     links = []
@@ -90,9 +99,22 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     return chances
 
 
-def join_observations(gains: Floats, date_of: np.ndarray) -> np.ndarray:
+def join_observations(gains: Floats, date_of: np.ndarray, is_late: np.ndarray) -> np.ndarray:
     """(S,) the track of each observation, such that gains within tracks are large; no track has two of one date.
-    `gains` (S, S) symmetric are of each pair in one track, 0 where not compared; `date_of` (S,) are date indices."""
+    `gains` (S, S) symmetric are of each pair in one track, 0 where not compared; `date_of` (S,) are date indices.
+
+    Observations `is_late` (S,) join the tracks of the others, on dates on which these have none. So a rolled leaf, that
+    looks like a stem, goes on as the leaf that it opens to, and that one not as the next rolled leaf in its place.
+    """
+    tracks, early = np.arange(len(gains)), ~is_late
+    tracks[early] = len(gains) + _join_all(gains[np.ix_(early, early)], date_of[early])
+    excluding = np.where(date_of[:, None] == date_of, -LINKING.asked, gains)
+    for date in np.unique(date_of[is_late]):
+        tracks = _rejoin(tracks, excluding, is_late & (date_of == date))
+    return tracks
+
+
+def _join_all(gains: Floats, date_of: np.ndarray) -> np.ndarray:
     tracks, dates = np.arange(len(gains)), np.unique(date_of)
     for date in dates[1:]:
         tracks = _rejoin(tracks, gains, date_of == date, among=date_of <= date)

@@ -25,7 +25,7 @@ class DateLeaves(Table):
         lengths: (N,).
         areas: (N,) one-sided; NaN where none is measured.
         base_sd, turn_sd: (N,) standard deviations of the base, in lengths, and of the azimuth, in radians.
-        is_oriented, is_surface: (N,) bool.
+        is_oriented, is_surface, is_doubted: (N,) bool; see `SeenLeaf`.
     """
 
     index: np.ndarray
@@ -38,6 +38,7 @@ class DateLeaves(Table):
     turn_sd: Floats
     is_oriented: np.ndarray
     is_surface: np.ndarray
+    is_doubted: np.ndarray
 
     @property
     def bases(self) -> Floats:
@@ -74,6 +75,7 @@ def leaves_of(date: PlantOnDate) -> DateLeaves:
         turn_sd=np.radians(np.array([sd(leaf, "azimuth") for leaf in shaped])),
         is_oriented=np.array([leaf.is_oriented for leaf in shaped], bool),
         is_surface=np.array(["length" in leaf.numbers for leaf in shaped], bool),
+        is_doubted=np.array([leaf.is_doubted for leaf in shaped], bool),
     )
 
 

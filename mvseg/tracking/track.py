@@ -136,14 +136,16 @@ def track_leaves(
 
 
 def _link_dates(
-    dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots
+    dates: Sequence[PlantOnDate], statements: Sequence[LeafLink], pots: Pots
 ) -> tuple[Comparison, list[Association]]:
     leaves = [leaves_of(date) for date in dates]
     knows_up = all(date.knows_up for date in dates)
-    same, different = _observations_of(links, dates)
+    same, different = _observations_of(statements, dates)
     times, counts = [date.time for date in dates], [len(each) for each in leaves]
     compared = compare_dates(leaves, times, knows_up=knows_up, pots=pots, same=same, different=different)
-    return compared, sum_over_poses(link_leaves(counts, compared.costs, same=same, different=different), compared)
+    doubted = np.concatenate([each.is_doubted for each in leaves])
+    links = link_leaves(counts, compared.costs, same=same, different=different, doubted=doubted)
+    return compared, sum_over_poses(links, compared)
 
 
 def _without_stems(

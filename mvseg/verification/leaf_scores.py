@@ -225,17 +225,19 @@ def rate_pass(
     return Rating(round(area, CHOICE.digits), round(expected, CHOICE.digits), num_leaves)
 
 
-def choose_rating(ratings: Sequence[Rating]) -> int:
-    """Index of the best one: the first whose agreed area no other exceeds by `CHOICE.growth`; less is chance.
+def order_ratings(ratings: Sequence[Rating]) -> list[int]:
+    """Indices of the answers among ratings, the best one first, then by the agreed area.
 
-    The area alone has a degenerate optimum, the whole plant as one leaf; so passes with too few leaves
-    (`CHOICE.least_leaves`) or correct masks (`CHOICE.least_expected`) are no answers, unless all are so.
+    The best one is the first whose agreed area no other exceeds by `CHOICE.growth`: less is chance. The area alone has
+    a degenerate optimum, the whole plant as one leaf; so passes with too few leaves (`CHOICE.least_leaves`) or correct
+    masks (`CHOICE.least_expected`) are no answers, unless all are so.
     """
-    least = CHOICE.least_expected * max(each.expected for each in ratings)
+    least = CHOICE.least_expected * max((each.expected for each in ratings), default=0.0)
     is_answer = [each.num_leaves >= CHOICE.least_leaves and each.expected >= least for each in ratings]
     answers = np.flatnonzero(is_answer if any(is_answer) else np.ones(len(ratings)))
-    areas = np.array([each.agreed_area for each in ratings])[answers]
-    return int(answers[np.argmax(CHOICE.growth * areas >= areas.max())])
+    areas = np.array([each.agreed_area for each in ratings])
+    first = next(iter(answers[CHOICE.growth * areas[answers] >= areas[answers].max(initial=0.0)]), None)
+    return sorted(answers.tolist(), key=lambda index: (index != first, -areas[index]))
 
 
 def log_odds(values: Floats) -> Floats:

@@ -50,7 +50,7 @@ def gain_of(tracks: np.ndarray | list[int], gains: np.ndarray) -> float:
 def test_no_parting_is_better(seed: int) -> None:
     gains, date_of, _ = draw_gains([2, 3, 2, 2], seed, noise=3.0)
     best = max(gain_of(tracks, gains) for tracks in every_partition(date_of))
-    found = join_observations(gains, date_of)
+    found = join_observations(gains, date_of, np.zeros(len(gains), bool))
     assert gain_of(found, gains) == pytest.approx(best, rel=0.02)
     for date in range(4):
         assert len(set(found[date_of == date])) == (date_of == date).sum()
@@ -58,7 +58,7 @@ def test_no_parting_is_better(seed: int) -> None:
 
 def test_leaves_that_are_alike_are_one_track() -> None:
     gains, date_of, leaf = draw_gains([5, 7, 6, 7, 4], 3, noise=0.5)
-    tracks = join_observations(gains, date_of)
+    tracks = join_observations(gains, date_of, np.zeros(len(gains), bool))
     assert ((tracks[:, None] == tracks) == (leaf[:, None] == leaf)).all()
 
 
@@ -71,6 +71,20 @@ def test_dates_around_outweigh_one_on_which_two_leaves_look_swapped() -> None:
     costs: Costs = {(0, 1): odd, (1, 2): alike, (0, 2): 2 * alike}
     assert ((0, 0), (1, 0)) in pairs_of(link_leaves([2, 2, 2], costs))
     assert ((0, 0), (1, 1)) in pairs_of(link_leaves([2, 2], {(0, 1): odd}))
+
+
+def test_a_rolled_leaf_goes_on_as_the_leaf_that_it_opens_to() -> None:
+    """As on an oil palm, whose next spear stands where the last one stood."""
+    both = np.array([[1.0, -6.0]])
+    costs: Costs = {(0, 1): np.array([[-9.0]]), (1, 2): both, (0, 2): both}
+    opened, spear = ((1, 0), (2, 0)), ((1, 0), (2, 1))
+    assert pairs_of(link_leaves([1, 1, 2], costs)) == [((0, 0), (1, 0)), spear]
+    for is_rolled in (False, True):  # on the first date
+        doubted = np.array([is_rolled, False, False, True])
+        assert pairs_of(link_leaves([1, 1, 2], costs, doubted=doubted)) == [((0, 0), (1, 0)), opened]
+    assert pairs_of(link_leaves([1, 1, 2], costs, same=[spear], doubted=doubted)) == [((0, 0), (1, 0)), spear]
+    alone = link_leaves([1, 1], {(0, 1): np.array([[-9.0]])}, doubted=np.array([False, True]))
+    assert pairs_of(alone) == [((0, 0), (1, 0))]  # nothing else is there
 
 
 def test_nothing_is_linked_across_dates_that_are_not_aligned() -> None:
