@@ -108,8 +108,6 @@ def read_calibration(folder: Path, file: str) -> Calibration:
         raise InputError(f"{path}: the distortion model '{model}' is not known, expected plumb_bob or equidistant")
     if any(content.distortion[8:]):
         raise InputError(f"{path}: has a thin prism or a tilted sensor (coefficients 9 to 14), which is not supported")
-    if len(distortion) not in (0, 4, 5, 8):
-        raise InputError(f"{path}: has {len(distortion)} distortion coefficients, expected 4, 5 or 8")
-    if is_fisheye and len(distortion) != 4:
-        raise InputError(f"{path}: a fisheye with {len(distortion)} coefficients, expected k1, k2, k3, k4")
+    if len(distortion) not in ((4,) if is_fisheye else (0, 4, 5, 8)):
+        raise InputError(f"{path}: has {len(distortion)} distortion coefficients, expected 4, 5 or 8, of a fisheye 4")
     return Calibration(K, tuple(distortion), is_fisheye=is_fisheye, width=content.width, height=content.height)

@@ -42,13 +42,13 @@ def link_leaves(
     *,
     same: Asked = (),
     different: Asked = (),
-    doubted: np.ndarray | None = None,
+    doubted: np.ndarray | bool = False,
 ) -> list[Association]:
     """The links of the cheapest tracks, by their earlier observation.
 
     `counts` are the leaves with a shape on each date; `same` and `different` pairs of observations that the user says
-    are one leaf, or are not; `doubted` (S,) bool, of all dates one after the other, those that look like a stem, see
-    `join_observations`. Raises InputError: the pairs contradict each other.
+    are one leaf, or are not; `doubted` (S,) bool, date after date, looks like a stem and is not named in such a pair,
+    see `join_observations`. Raises InputError: the pairs contradict each other.
     """
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     date_of, gains = np.repeat(np.arange(len(counts)), counts), np.zeros((starts[-1], starts[-1]))
@@ -59,9 +59,7 @@ def link_leaves(
     for place, gain in asked.items():
         gains[place] = gain
     gains += gains.T
-    is_late = np.zeros(len(gains), bool) if doubted is None else doubted.copy()
-    is_late[[*chain(*asked)]] = False
-    tracks = join_observations(gains, date_of, is_late)
+    tracks = join_observations(gains, date_of, doubted & ~np.isin(np.arange(len(gains)), [*chain(*asked)]))
     if any((tracks[one] == tracks[other]) != (gain > 0) for (one, other), gain in asked.items()):
         raise InputError("what the user says of leaves over days contradicts itself")
     links = []
@@ -99,18 +97,18 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     return chances
 
 
-def join_observations(gains: Floats, date_of: np.ndarray, is_late: np.ndarray) -> np.ndarray:
+def join_observations(gains: Floats, date_of: np.ndarray, doubted: np.ndarray) -> np.ndarray:
     """(S,) the track of each observation, such that gains within tracks are large; no track has two of one date.
     `gains` (S, S) symmetric are of each pair in one track, 0 where not compared; `date_of` (S,) are date indices.
 
-    Observations `is_late` (S,) join the tracks of the others, on dates on which these have none. So a rolled leaf, that
-    looks like a stem, goes on as the leaf that it opens to, and that one not as the next rolled leaf in its place.
+    Observations that are `doubted` (S,) bool, since they look like a stem, join the tracks of the others where these
+    have none on a date. So a rolled leaf goes on as the leaf that it opens to, not as the next one in its place.
     """
-    tracks, early = np.arange(len(gains)), ~is_late
-    tracks[early] = len(gains) + _join_all(gains[np.ix_(early, early)], date_of[early])
+    tracks, sure = np.arange(len(gains)), ~doubted
+    tracks[sure] = len(gains) + _join_all(gains[np.ix_(sure, sure)], date_of[sure])
     excluding = np.where(date_of[:, None] == date_of, -LINKING.asked, gains)
-    for date in np.unique(date_of[is_late]):
-        tracks = _rejoin(tracks, excluding, is_late & (date_of == date))
+    for date in np.unique(date_of[doubted]):
+        tracks = _rejoin(tracks, excluding, doubted & (date_of == date))
     return tracks
 
 

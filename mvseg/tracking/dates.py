@@ -55,7 +55,7 @@ class SeenLeaf:
             midrib.
         is_oriented: the first point of the midrib is known to be the base.
         is_doubted: it looks like a stem, as rolled leaves of seedlings do: it counts if another date shows the leaf.
-        node: numbers of its stem and of its node there; None: it is not known to sit on one.
+        node, node_place: numbers of its stem and of its node, and (3,) where that is; None: not known to sit on one.
     """
 
     leaf: int
@@ -66,6 +66,7 @@ class SeenLeaf:
     numbers: Numbers
     is_doubted: bool = False
     node: tuple[int, int] | None = None
+    node_place: Floats | None = None
 
     @property
     def length(self) -> float:
@@ -142,8 +143,10 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
             stem, node = nodes.get(leaf.leaf, (0, None))
             of_node = {} if node is None else {name: getattr(node, name) for name in OF_NODES}
             observation = _see_leaf(leaf.leaf, shape, numbers_of({**leaf.numbers, **of_node}), frame)
-            place = None if node is None else (stem, node.number)
-            leaves.append(replace(observation, is_doubted=leaf.rejection is not None, node=place))
+            if node is not None:
+                place = np.array(node.place) if frame is None else frame @ np.array(node.place)
+                observation = replace(observation, node=(stem, node.number), node_place=place)
+            leaves.append(replace(observation, is_doubted=leaf.rejection is not None))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
         knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole), up_from=traits.up_from,
@@ -221,10 +224,9 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
         return {name: Number(n.value * times, n.sd * times, unit) for name, (n, unit, times) in found.items()}
 
     def enlarge(leaf: SeenLeaf) -> SeenLeaf:
-        leaf = replace(leaf, numbers=convert(leaf.numbers))
-        if leaf.midrib is None or leaf.points is None:
-            return leaf
-        return replace(leaf, midrib=leaf.midrib * factor, points=leaf.points * factor)
+        places = {name: getattr(leaf, name) for name in ("midrib", "points", "node_place")}
+        enlarged = {name: each * factor for name, each in places.items() if each is not None}
+        return replace(leaf, numbers=convert(leaf.numbers), **enlarged)
 
     return replace(date, unit=first.unit, leaves=tuple(map(enlarge, date.leaves)), whole=convert(date.whole))
 

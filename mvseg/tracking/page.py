@@ -79,13 +79,15 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
             if leaf.points is not None and leaf.midrib is not None:
                 grid = leaf.points.reshape(OBSERVATIONS.rows, 3, 3)  # once around the surface, base to tip and back
                 shape = np.concatenate([grid[:, 0], grid[::-1, 2]]) if "length" in leaf.numbers else leaf.midrib
-            placed = (shape @ pose[:3, :3].T + pose[:3, 3] - middle) / scale * 1000
+            node = np.zeros((0, 3)) if leaf.node_place is None else leaf.node_place[None]
+            in_plant = [(each @ pose[:3, :3].T + pose[:3, 3] - middle) / scale * 1000 for each in (shape, node)]
+            line, at = (np.round(each).astype(int).ravel().tolist() for each in in_plant)
             leaves.append(
                 {"date": index, "leaf": leaf.leaf, "track": row.track, "p": _round(row.probability, 3),
                  "state": row.state, "flat": "length" in leaf.numbers,
                  "crop": base64.b64encode(picture.jpeg).decode("ascii") if picture else "",
                  "place": [picture.view, *picture.at] if picture else None,
-                 "shape": np.round(placed).astype(int).ravel().tolist(), "node": _describe_node(leaf, pose)}
+                 "shape": line, "at": at, "node": _describe_node(leaf, pose)}
             )  # fmt: skip
     return {
         "plant": tracks.plant,

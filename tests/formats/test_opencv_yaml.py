@@ -96,7 +96,7 @@ BAD = [
     (ROS.replace("-0.12, ", "-0.12, 1, "), "has 6 distortion coefficients, expected 4, 5 or 8"),
     (ROS.replace("[-0.12,", "[0, 0, 0, 0, 0, 0, -0.12,"), r"has a thin prism or a tilted sensor"),
     (ROS.replace("plumb_bob", "omni"), "the distortion model 'omni' is not known, expected plumb_bob or equidistant"),
-    (ROS.replace("plumb_bob", "equidistant"), "a fisheye with 5 coefficients, expected k1, k2, k3, k4"),
+    (ROS.replace("plumb_bob", "equidistant"), "has 5 distortion coefficients, expected 4, 5 or 8, of a fisheye 4"),
     (ROS.replace("1280", "-1"), "width: Input should be greater than or equal to 1"),
     ("#" * (1 << 20) + "\n", "is larger than 1048576 bytes"),
     ("\0", r"is not a YAML file"),

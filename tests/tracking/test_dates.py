@@ -84,15 +84,13 @@ def test_points_that_are_no_numbers_are_refused() -> None:
 
 def test_units_are_converted_or_refused() -> None:
     first, other = see(grow_blades(4, 0), 0)[0], see(grow_blades(4, 0), 1, unit="cm")[0]
+    other = replace(other, leaves=(replace(other.leaves[0], node_place=np.ones(3)), *other.leaves[1:]))
     _, later = order_dates([first, other])
     assert later.unit == "mm"
     assert later.leaves[0].length == pytest.approx(10 * other.leaves[0].length)
     area, before = later.leaves[0].numbers["area"], other.leaves[0].numbers["area"]
-    assert (area.unit, area.value, area.sd) == (
-        "mm^2",
-        pytest.approx(100 * before.value),
-        pytest.approx(100 * before.sd),
-    )
+    assert (area.unit, later.leaves[0].node_place.tolist()) == ("mm^2", [10, 10, 10])
+    assert (area.value, area.sd) == pytest.approx((100 * before.value, 100 * before.sd))
     with pytest.raises(InputError, match="day-0 is in mm and day-1 in no unit"):
         order_dates([first, replace(other, unit="")])
 
@@ -162,7 +160,7 @@ def test_results_in_memory() -> None:
     stem = Stem(1, StemAxis.along(np.array([[0.0, 0, 0], [0, 0, 1]])), "leaf bases", (node,), UNCLEAR)
     result.traits = replace(traits, stems=(stem,))
     on_stem, elsewhere = date_of(result, 3).leaves
-    assert (on_stem.node, elsewhere.node) == ((1, 2), None)
+    assert (on_stem.node, [*on_stem.node_place], elsewhere.node) == ((1, 2), [0, 0, 1], None)
     assert on_stem.numbers["internode"] == Number(9.0, 1.0, "mm")
     assert on_stem.numbers["divergence"] == Number(137.5, 4.0, "degree")
     assert "node_azimuth" not in on_stem.numbers

@@ -43,6 +43,7 @@ function drawDate(canvas, date) {
     return { leaf, path, middle: middleOf(line) };
   });
   pen.globalAlpha = 1;
+  drawAxes(pen, date, turn);
   pen.font = "bold 11px system-ui, sans-serif";
   pen.textAlign = "center";
   pen.lineWidth = 3;
@@ -50,6 +51,19 @@ function drawDate(canvas, date) {
     if (picked && leaf.track !== picked) continue;
     pen.strokeStyle = "#fffc"; pen.fillStyle = "#000";
     pen.strokeText(leaf.track, x, y); pen.fillText(leaf.track, x, y);
+  }
+}
+
+// Stems from node to node, a dot for each node.
+function drawAxes(pen, date, turn) {
+  const sitting = data.leaves.filter((leaf) => leaf.date === date && leaf.node).sort((one, other) => one.node.height - other.node.height);
+  pen.strokeStyle = pen.fillStyle = "#4a3a28"; pen.lineWidth = 2;
+  for (const stem of new Set(sitting.map(({ node }) => node.stem))) {
+    const places = project(sitting.filter(({ node }) => node.stem === stem).flatMap(({ at }) => at), turn);
+    pen.beginPath();
+    places.forEach(([x, y], n) => (n ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+    pen.stroke();
+    for (const [x, y] of places) { pen.beginPath(); pen.arc(x, y, 3, 0, 2 * Math.PI); pen.fill(); }
   }
 }
 
