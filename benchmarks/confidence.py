@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 from collections import defaultdict
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -170,17 +169,13 @@ def print_groups(outcomes: list[Outcome]) -> None:
         scores, right = (np.concatenate([getattr(each, what) for each in rows]) for what in ("scores", "is_right"))
         is_spoilt = [each.ari < SPOILT and base[id(each)] - each.ari > LOSS for each in rows]
         is_sound = [each.ari >= SPOILT for each in rows]
-        figures = (right.mean(), scores.mean(), calibration_error(scores, right), mean(each.ari for each in rows))
+        figures = (right.mean(), scores.mean(), calibration_error(scores, right), np.mean([each.ari for each in rows]))
         counts = (len(rows), sum(is_spoilt), warned(rows, is_spoilt), sum(is_sound), warned(rows, is_sound))
         print(f"{name:22}{len(right):8}" + "".join(f"{x:8.3f}" for x in figures) + "".join(f"{n:8}" for n in counts))
 
 
 def warned(outcomes: list[Outcome], chosen: list[bool]) -> int:
     return sum(each.is_warned for each, is_chosen in zip(outcomes, chosen, strict=True) if is_chosen)
-
-
-def mean(values: Iterable[float]) -> float:
-    return float(np.mean(list(values)))
 
 
 def main() -> None:

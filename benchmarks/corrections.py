@@ -33,7 +33,6 @@ from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.pipeline.plant import Plant
 from mvseg.regions import IGNORE_LABEL
-from mvseg.results.result import Result
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
@@ -48,12 +47,10 @@ class Case:
     """A scene with the masks that a person corrects.
 
     Attributes:
-        name: of its files.
         plant: what is known before edits.
         truth: V label maps.
     """
 
-    name: str
     plant: Plant
     truth: Sequence[Labels]
 
@@ -66,7 +63,7 @@ def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -
     """A scene whose leaves the detector finds."""
     kept = None if cache is None else CachedDetections(cache)
     plant = find_in_photos(open_scene(folder, None, config), cache=kept)
-    return Case(f"detected_{folder.name}", plant, true_maps(folder, plant.scene))
+    return Case(plant, true_maps(folder, plant.scene))
 
 
 def render(spec: SceneSpec, cache: Path) -> Path:
@@ -81,18 +78,13 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 # --- rounds
 
 
-def compute(case: Case, corrections: Corrections) -> Result:
-    """What a run makes of the scene with these corrections, without traits."""
-    return shape_leaves(apply_edits(case.plant, corrections))
-
-
 def correct(case: Case) -> tuple[list[tuple[int, float, float]], int]:
     """After each round the number of answers, MV-PQ and the share of leaves that is right; and the leaves harmed."""
     rounds, harmed, edits, done = [], 0, tuple[Edit, ...](), set[str]()
     right, touched = frozenset[int](), frozenset[int]()  # leaves, after the last round, and that its answers are about
     most = math.ceil(RATES[-1] * case.num_leaves)
     while True:
-        result = compute(case, Corrections(edits))
+        result = shape_leaves(apply_edits(case.plant, Corrections(edits)))
         masks = result.masks.to("cpu")
         doubts = list_mask_questions(masks, result.surfaces, cameras=result.scene.cameras, rejected=result.rejected)
         look = Look(masks, case.truth, result.scene, doubts)

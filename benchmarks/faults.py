@@ -34,17 +34,8 @@ class Faults:
 
 
 def degrade_labels(labels: Labels, faults: Faults, *, seed: int) -> Labels:
-    """The masks of a faulty segmenter, from the true masks of one view.
-
-    Args:
-        labels: (H, W) uint16, 0 = no instance, every other number is one mask.
-        faults: how often it errs.
-        seed: the same labels and seed give the same faults.
-
-    Returns:
-        (H, W) uint16, masks numbered from 1 in no particular order; the numbers have nothing to do with those of
-        `labels`. Where dilated masks overlap, the smaller one is on top.
-    """
+    """The masks (H, W) of a faulty segmenter, from the true masks (H, W) of one view, 0 = none. Their numbers, from 1,
+    have nothing to do with those of `labels`. Where dilated masks overlap, the smaller one is on top."""
     rng = np.random.default_rng(seed)
     numbers = [n for n in np.unique(labels).tolist() if n and rng.random() >= faults.missed]
     masks = [labels == number for number in numbers]

@@ -29,7 +29,6 @@ from benchmarks.spread import write_turned
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import true_instances
@@ -119,8 +118,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--person", action=argparse.BooleanOptionalAction, default=True)
-    parser.add_argument("--image_size", type=int, default=None)
     parser.add_argument("--table", action="store_true", help="a row for each scene, as it comes")
     parser.add_argument("--worlds", type=int, default=1, help="of --table; the spread needs two or more")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
@@ -133,8 +130,8 @@ def main() -> None:
             print_as_it_comes(folder, CachedDetections(args.cache / folder.resolve().name), args.worlds)
         return
     for folder in args.scenes:
-        config = RunConfig(reconstruct=None, learn="off", detect=DetectConfig(image_size=args.image_size))
-        opened, begun = open_scene(folder, None, config), time.process_time()
+        opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off"))
+        begun = time.process_time()
         cache = CachedDetections(args.cache / folder.resolve().name)
         first = plant = find_in_photos(opened, cache=cache)
         truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
@@ -149,7 +146,7 @@ def main() -> None:
             stays = stays and order_ratings([before.rating, after])[0] == 1
             name = f"round {number}, at {plant.image_size} px"
             show(name, plant, truth, stays="yes" if stays else "no", begun=begun)
-        if args.person and truth is not None:
+        if truth is not None:
             begun, corrections = time.process_time(), outline_some(first, truth)
             plant = learn(first, cache=cache, corrections=corrections, rounds=1)
             show(f"{DRAWN} leaves of a person, learned", plant, truth, stays="", begun=begun)

@@ -24,6 +24,7 @@ from benchmarks.choice import true_maps
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.numbers import DETECTION
+from mvseg.detectors import MIN_IMAGE_SIZE
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.pipeline.find_in_photos import choose_size, colors_to_judge_by, run_pass, select_judges
@@ -75,7 +76,7 @@ def sweep(folder: Path, cache: Path) -> tuple[float, float]:
     print(f"\n**{folder.resolve().name}**, {len(views)} photos\n")
     print("| px | leaves | agreement | agreed area, Mpx | E | MV-PQ | CPU s |\n" + "|---" * 7 + "|")
     results = [show(first, time.process_time())]
-    while (size := results[0].image_size * DETECTION.size_step ** len(results)) >= DETECTION.min_image_size:
+    while (size := results[0].image_size * DETECTION.size_step ** len(results)) >= MIN_IMAGE_SIZE:
         results.append(see(round(size)))
     by_size = {round(results[0].image_size * DETECTION.size_step**n): each for n, each in enumerate(results)}
     best = results[order_ratings([each.rating for each in results])[0]]

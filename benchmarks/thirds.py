@@ -228,9 +228,6 @@ def choose_found(args: argparse.Namespace) -> Iterator[Trial]:
             yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, case.plant, drawn), case.truth)
 
 
-TRIALS = {"given": check_given, "simulated": check_simulated, "found": choose_found}
-
-
 def check_trial(name: str, regions: Regions, cameras: Cameras, truth: Iterable[np.ndarray]) -> Trial:
     """Surfaces check the ids of given masks."""
     masks = match_masks(Masks.of(regions), cameras).masks
@@ -277,7 +274,7 @@ def count_changed(before: Masks, after: Masks) -> int:
 
 
 def thirds_of_verification(args: argparse.Namespace) -> None:
-    trials = [trial for name in args.trials for trial in TRIALS[name](args)]
+    trials = [*check_given(args), *check_simulated(args), *choose_found(args)]
     before = [(masks := trial.run().to("cpu"), judge(masks, trial)) for trial in trials]
     for trial, (masks, metrics) in zip(trials, before, strict=True):
         scores = f"pair F1 {metrics.all_pair_f1:.3f}, MV-PQ {metrics.mv_pq:.3f}"
@@ -399,7 +396,6 @@ def main() -> None:
     parser.add_argument("--room", choices=ROOMS, default="matching")
     parser.add_argument("--numbers", nargs="+", help="only these")
     parser.add_argument("--masks", choices=KINDS, default="degraded", help="that leaves are reconstructed from")
-    parser.add_argument("--trials", choices=TRIALS, nargs="+", default=list(TRIALS), help="of verification")
     parser.add_argument("--given", type=Path, nargs="*", default=[], help="plants to check, with masks/ and truth/")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], help="more to verify, with photos and truth/")
     parser.add_argument("--series", type=Path, nargs="*", default=[], help="TABLE RESULTS of real series to track")

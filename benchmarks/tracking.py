@@ -55,6 +55,7 @@ from mvseg.tracking.track import Tracks, track_leaves
 from mvseg.traits.measure import measure_plant
 
 IGNORED = 65535  # in true labels
+MISSED = 0.05  # share of the leaves of a simulated plant
 Labels = list[list[int]]  # per date, one number per leaf: a track, or the true id
 
 
@@ -62,33 +63,27 @@ Labels = list[list[int]]  # per date, one number per leaf: a track, or the true 
 
 
 def see_plant(
-    plant: SimulatedPlant,
-    time: float,
-    rng: np.random.Generator,
-    *,
-    noise: float = 1.0,
-    missed: float = 0.05,
-    scene: str = "s",
+    plant: SimulatedPlant, time: float, rng: np.random.Generator, *, scene: str
 ) -> tuple[PlantOnDate, list[int]]:
     """A date as surfaces would show it: ends of midribs off by 3 % of the length, one base in 30 at the wrong end (of
     those that are not sure of it, one in three), some leaves missed. And the true ids of its leaves."""
     seen: list[tuple[SeenLeaf, int]] = []
     for leaf in plant.leaves:
-        if rng.random() < missed:
+        if rng.random() < MISSED:
             continue
-        off, sd = rng.normal(0, 0.03 * noise * leaf.length, (2, 3)), 0.03 * noise * leaf.length
+        off, sd = rng.normal(0, 0.03 * leaf.length, (2, 3)), 0.03 * leaf.length
         share = np.linspace(0, 1, OBSERVATIONS.stations)[:, None]
         clear = see_surface(0, leaf.vertices, BLADE_COLUMNS, {}, is_oriented=True)
         assert clear.midrib is not None
         assert clear.points is not None
         midrib = clear.midrib + (1 - share) * off[0] + share * off[1]
-        midrib += np.sin(np.pi * share) * rng.normal(0, 0.02 * noise * leaf.length, 3)
+        midrib += np.sin(np.pi * share) * rng.normal(0, 0.02 * leaf.length, 3)
         is_oriented = bool(rng.random() < 0.8)
         if rng.random() < (0.03 if is_oriented else 0.3):
             midrib = midrib[::-1]
         numbers = {
             "length": Number(leaf.length + float(rng.normal(0, sd)), sd, "mm"),
-            "area": Number(leaf.area * (1 + float(rng.normal(0, 0.05 * noise))), 0.05 * leaf.area, "mm^2"),
+            "area": Number(leaf.area * (1 + float(rng.normal(0, 0.05))), 0.05 * leaf.area, "mm^2"),
             "insertion_height": Number(float(midrib[0, 2]), sd, "mm"),
             "azimuth": Number(0.0, 3.0, "degree"),
         }
@@ -101,13 +96,11 @@ def see_plant(
     return date, [seen[place][1] for place in order]
 
 
-def see_series(spec: SeriesSpec, *, noise: float = 1.0, missed: float = 0.05) -> tuple[list[PlantOnDate], Labels]:
+def see_series(spec: SeriesSpec) -> tuple[list[PlantOnDate], Labels]:
     """All dates of a simulated plant, and the true ids."""
     rng = np.random.default_rng([spec.seed, 9])
-    plants = list(zip(grow_series(spec), spec.times, strict=True))
-    seen = [
-        see_plant(plant, time, rng, noise=noise, missed=missed, scene=f"{spec.name}_{time:g}") for plant, time in plants
-    ]
+    plants = zip(grow_series(spec), spec.times, strict=True)
+    seen = [see_plant(plant, time, rng, scene=f"{spec.name}_{time:g}") for plant, time in plants]
     return [date for date, _ in seen], [truth for _, truth in seen]
 
 

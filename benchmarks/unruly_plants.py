@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.camera_faults import rotate_cameras
+from benchmarks.skins import dress, list_skins
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
 from mvseg.scene import Scene, View
@@ -26,7 +27,6 @@ from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import Floats
 from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.simulation.scene_writer import drop_small, shuffle_labels, write_jpeg
-from mvseg.simulation.skins import dress, list_skins
 from mvseg.simulation.wild import make_wild, roll_up
 
 PLANTS = (("ovate", 18, 10, 71), ("leggy", 12, 12, 72), ("lanceolate", 16, 10, 73), ("compound", 20, 8, 74))

@@ -26,28 +26,12 @@ NUM_SOURCES = 20  # views that each view is compared with at most, COLMAP's defa
 POINTS_PER_VIEW = 50  # of the artificial sparse model
 
 
-@dataclass(frozen=True, eq=False)
-class DensePoints:
-    """P points on the surfaces of a scene.
-
-    Attributes:
-        positions: (P, 3) float64, world frame of the scene's cameras; none when stereo found nothing.
-        backend: what made them. Results of different backends must not be mixed.
-    """
-
-    positions: Tensor
-    backend: str
-
-
-def sgbm_points(scene: Scene) -> DensePoints:
-    """Points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; backend "sgbm".
-
-    There are none when no two views are within 25 degrees of each other. Raises InputError: a photo is missing or
-    broken.
-    """
+def sgbm_points(scene: Scene) -> Tensor:
+    """(P, 3) float64 world points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; none when no
+    two views are within 25 degrees of each other. Raises InputError: a photo is missing or broken."""
     photos, cameras = read_small_photos(scene)
     depths = sgbm_depths([cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY) for photo in photos], cameras)
-    return DensePoints(fuse_depths(photos, depths, cameras), "sgbm")
+    return fuse_depths(photos, depths, cameras)
 
 
 def fuse_depths(photos: list[np.ndarray], depths: list[np.ndarray], cameras: Cameras) -> Tensor:

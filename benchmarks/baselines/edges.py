@@ -25,14 +25,7 @@ def edge_graph(pairs: Tensor, num_regions: int) -> Affinity:
     return Affinity(edges, torch.ones(len(edges), device=pairs.device), num_regions)
 
 
-def match_graph(affinity: Affinity, regions: Regions, config: MatchConfig, *, method: str) -> Matching:
-    """Cluster any graph of the regions with SymNMF, |k| by Eq. 7.
-
-    Args:
-        affinity: the graph of D regions.
-        regions: whose numbers per view set the default range for the number of instances.
-        config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
-        method: the `MatchReport.method` of the result.
-    """
-    clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, config)
+def match_graph(affinity: Affinity, regions: Regions, *, method: str) -> Matching:
+    """Cluster any graph of the regions with SymNMF, |k| by Eq. 7; `method` is that of the result's `MatchReport`."""
+    clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, MatchConfig())
     return matching_of_ids(clustering.instance_ids, regions, affinity, method=method)

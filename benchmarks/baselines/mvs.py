@@ -5,42 +5,27 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.dense_points import DensePoints
 from benchmarks.baselines.edges import edge_graph, match_graph
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import check_views
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
+MVS = "mvs (sgbm)"  # name of the method, with that of the stereo (see `dense_points`)
 NEAREST_SHARE = 0.1  # of the points in a region; their centroid stands for the region
 
 
-def match_mvs(regions: Regions, scene: Scene, points: DensePoints, *, config: MatchConfig = MatchConfig()) -> Matching:
-    """Match regions by dense points (Sec. 4.2, "MVS-based matching").
-
-    Args:
-        regions: D regions in V views.
-        scene: V >= 2 cameras.
-        points: of the scene, in the world frame of its cameras.
-        config: see `match_graph`.
-
-    Returns:
-        The matching, method "mvs (<backend of the points>)". A region that no point projects into has edges only from
-        the points of other regions; a region without any edge is -1.
-
-    Raises:
-        InputError: no points at all ("N/A" in the paper's tables), fewer than two views, or regions and cameras of
-            different numbers of views.
-    """
+def match_mvs(regions: Regions, scene: Scene, points: Tensor) -> Matching:
+    """Match regions by dense world points (P, 3) (Sec. 4.2, "MVS-based matching"). A region that no point projects into
+    has edges only from the points of other regions; a region without any edge is -1. Raises InputError: no points at
+    all ("N/A" in the paper's tables), or see `check_views`."""
     check_views(regions, scene.cameras)
-    if not len(points.positions):
-        raise InputError(f"multi-view stereo ({points.backend}) found no points in scene '{scene.name}': no matching")
-    cameras = scene.cameras.to(regions.device)
-    graph = projection_graph(regions, cameras, points.positions.to(regions.device))
-    return match_graph(graph, regions, config, method=f"mvs ({points.backend})")
+    if not len(points):
+        raise InputError(f"multi-view stereo (sgbm) found no points in scene '{scene.name}': no matching")
+    graph = projection_graph(regions, scene.cameras.to(regions.device), points.to(regions.device))
+    return match_graph(graph, regions, method=MVS)
 
 
 def projection_graph(regions: Regions, cameras: Cameras, points: Tensor) -> Affinity:

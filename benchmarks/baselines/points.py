@@ -7,7 +7,6 @@ from torch import Tensor
 
 from benchmarks.baselines.edges import edge_graph, match_graph
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching
@@ -17,23 +16,12 @@ from mvseg.scene import Cameras, Scene
 PARALLEL = 1e-12  # squared sine of the angle of two rays below which they have no nearest points
 
 
-def match_points(regions: Regions, scene: Scene, config: MatchConfig = MatchConfig()) -> Matching:
-    """Match regions by the rays through their centroids (Sec. 4.2, "Point-based matching").
-
-    Args:
-        regions: D regions in V views.
-        scene: V >= 2 cameras; the photos are not used.
-        config: see `match_graph`.
-
-    Returns:
-        The matching, method "points".
-
-    Raises:
-        InputError: fewer than two views, or regions and cameras of different numbers of views.
-    """
+def match_points(regions: Regions, scene: Scene) -> Matching:
+    """Match regions by the rays through their centroids (Sec. 4.2, "Point-based matching"). Raises InputError: see
+    `check_views`."""
     check_views(regions, scene.cameras)
     graph = nearest_ray_graph(regions, scene.cameras.to(regions.device))
-    return match_graph(graph, regions, config, method="points")
+    return match_graph(graph, regions, method="points")
 
 
 def nearest_ray_graph(regions: Regions, cameras: Cameras) -> Affinity:

@@ -13,7 +13,6 @@ from torch import Tensor
 from benchmarks.baselines.edges import edge_graph, match_graph
 from mvseg.formats.photos import read_photo
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import check_views
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
@@ -36,7 +35,7 @@ class Keypoints:
     descriptors: Tensor
 
 
-def match_sparse(regions: Regions, scene: Scene, config: MatchConfig = MatchConfig()) -> Matching:
+def match_sparse(regions: Regions, scene: Scene) -> Matching:
     """Match regions by the keypoints that they share (Sec. 4.2, "sparse feature correspondences").
 
     The paper's AKAZE is used where OpenCV has it: 4.x, or 5 with its contributed modules. Plain OpenCV 5 has only SIFT
@@ -48,7 +47,7 @@ def match_sparse(regions: Regions, scene: Scene, config: MatchConfig = MatchConf
     detector, name = keypoint_detector()
     keypoints = [find_keypoints(read_photo(scene, view), detector) for view in range(len(scene.views))]
     graph = keypoint_graph(regions, scene.cameras, keypoints)
-    return match_graph(graph, regions, config, method=f"sparse ({name})")
+    return match_graph(graph, regions, method=f"sparse ({name})")
 
 
 def keypoint_detector() -> tuple[Any, str]:

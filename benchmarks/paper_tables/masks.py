@@ -58,7 +58,8 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
 
 
 def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detector: str) -> Masks:
-    """The same for photos (3, H, W) float32 in [0, 1] with true label maps (H, W)."""
+    """The same for photos (3, H, W) float32 in [0, 1] with true label maps (H, W). Each mask shows the leaf whose true
+    mask it has its best IoU with, if that is 0.5 or more."""
     from mvseg.detectors.run import detect
     from mvseg.detectors.zoo import load_detector
 
@@ -71,18 +72,14 @@ def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detecto
                 mask = Crop.of(soft > 0.5)
                 if score >= DetectConfig.min_score and mask.area >= MIN_PIXELS:
                     rows.append((view, mask, len(rows)))
-    return tie_detections(stack_regions(rows, len(truth)), truth)
+    regions = stack_regions(rows, len(truth))
+    leaf = tied_instances(regions, truth)
+    found = set(zip(regions.view_index[leaf > 0].tolist(), leaf[leaf > 0].tolist(), strict=True))
+    num_true = sum(len(set(np.unique(labels)) - {0, IGNORE_LABEL}) for labels in truth)
+    return Masks(regions, leaf, num_missed=num_true - len(found))
 
 
 def most_shown(regions: Regions, truth: Sequence[np.ndarray]) -> Tensor:
     """(D,) int64: the leaf that each region shows most of, 0 when it shows none or mostly ignored pixels."""
     shown = true_instances(regions, truth, count_background=False)
     return torch.where(shown == IGNORE_LABEL, 0, shown)
-
-
-def tie_detections(regions: Regions, truth: Sequence[np.ndarray]) -> Masks:
-    """The masks of a detector; each shows the leaf whose true mask it has its best IoU with, if that is 0.5 or more."""
-    leaf = tied_instances(regions, truth)
-    found = set(zip(regions.view_index[leaf > 0].tolist(), leaf[leaf > 0].tolist(), strict=True))
-    num_true = sum(len(set(np.unique(labels)) - {0, IGNORE_LABEL}) for labels in truth)
-    return Masks(regions, leaf, num_missed=num_true - len(found))

@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from benchmarks.baselines.dense_points import DensePoints, sgbm_points
+from benchmarks.baselines.dense_points import sgbm_points
 from benchmarks.baselines.mvs import match_mvs
 from benchmarks.baselines.points import match_points
 from benchmarks.baselines.sparse import match_sparse
@@ -25,15 +26,15 @@ from mvseg.regions import Regions
 Method = Callable[[Regions, Cell, Path], Matching]
 
 
-def dense_points(cell: Cell, cache: Path) -> DensePoints:
-    """The points of semi-global matching (the paper's PatchMatch needs a graphics card), cached beside the records."""
+def dense_points(cell: Cell, cache: Path) -> Tensor:
+    """(P, 3) points of semi-global matching (PatchMatch needs a graphics card), cached beside the records."""
     origin = cell.folder.parents[1].name if cell.axes else "real"  # simulated scenes differ by size and seed
     path = cache / "points" / origin / f"{cell.name}.npy"
     if not path.is_file():
-        positions = sgbm_points(cell.scene).positions.numpy()
+        positions = sgbm_points(cell.scene).numpy()
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, positions)
-    return DensePoints(torch.from_numpy(np.load(path)), "sgbm")
+    return torch.from_numpy(np.load(path))
 
 
 def mvis(method: Literal["symnmf", "one-per-view", "nview"]) -> Method:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.semantic import reconstruct_semantic
+from benchmarks.baselines.mvs import MVS
 from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.masks import Masks
 from benchmarks.paper_tables.methods import dense_points
@@ -97,27 +97,25 @@ def measure_shape(cell: Cell, masks: Masked, name: str, *, cache: Path) -> Recor
 
 def dense(cell: Cell, masks: Masked, cache: Path) -> Record:
     """All points of stereo: on leaves, stems, pot and ground."""
-    points = dense_points(cell, cache)
-    return {"by": f"mvs ({points.backend})", "0.5": measure_points(points.positions.numpy(), true_leaves(cell))}
+    return {"by": MVS, "0.5": measure_points(dense_points(cell, cache).numpy(), true_leaves(cell))}
 
 
 def dense_on_leaves(cell: Cell, masks: Masked, cache: Path) -> Record:
     """The points of stereo that lie in some true mask of more than half of the views."""
     points = dense_points(cell, cache)
-    shares = torch.stack(list(is_in_mask(cell, masks("true"), points.positions))).double().mean(0)
-    on_leaves = points.positions[shares > PAPER_THRESHOLD].numpy()
-    return {"by": f"mvs ({points.backend})", "0.5": measure_points(on_leaves, true_leaves(cell))}
+    shares = torch.stack(list(is_in_mask(cell, masks("true"), points))).double().mean(0)
+    return {"by": MVS, "0.5": measure_points(points[shares > PAPER_THRESHOLD].numpy(), true_leaves(cell))}
 
 
 def semantic(kind: str) -> Shape:
-    """All masks of a view together; voxels twice as large as for single leaves, because there are many more."""
+    """The "silhouettes of all leaves" of Sec. 4.3; voxels twice as large as for single leaves: there are many more."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
         truth = true_leaves(cell)
         config = ReconstructConfig(threshold=PAPER_THRESHOLD, voxel_size=2 * truth.mean_length / VOXELS_PER_LEAF)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
-            grid = reconstruct_semantic(masks(kind).regions, cell.scene, config)
+            grid = back_project(masks(kind).regions, cell.scene.cameras, config=config)
         points = np.zeros((0, 3)) if grid is None else grid.points.numpy()
         return {"0.5": measure_points(points, truth)}
 

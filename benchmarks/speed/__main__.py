@@ -19,8 +19,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from benchmarks.skins import list_skins
 from benchmarks.unruly_plants import ZOOM, write_unruly
-from mvseg.simulation.skins import list_skins
 
 ROOT = Path(__file__).parents[2]
 PHOTOS = (12, 20, 46)

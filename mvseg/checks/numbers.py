@@ -71,7 +71,6 @@ class PhotoNumbers:
     burnt: float = 0.7  # chosen: share of white pixels above which a photo is overexposed
     gamma: float = 2.2  # definition: exponent of light in photos: blur mixes light, edges are where it is halfway
     smooth_px: float = 4.0  # chosen: pixels over which light hardly changes, unlike ink and paper at an edge
-    shift: int = 4  # limit: bits of a pixel's fraction in OpenCV's polygons
     least_iou: float = 0.75  # chosen: IoU of a mask with its shape; shapes have 0.93 and more, noise up to 0.72
 
 

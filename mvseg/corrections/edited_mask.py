@@ -11,9 +11,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.numbers import IMAGE
 from mvseg.regions import stack_regions
 
 Key = tuple[int, int]  # of a mask: the edit that made it, or 0, and which of its masks it is
@@ -43,7 +43,7 @@ def side_of(line: NDArray[np.float64], crop: Crop) -> Tensor:
     aside = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * far
     polygon = np.concatenate((line, [line[-1] + aside, line[0] + aside])) - 0.5  # from pixel corners to centres
     side = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(side, [np.round(polygon * 2**EDITS.fine).astype(np.int32)], 1, shift=EDITS.fine)
+    cv2.fillPoly(side, [np.round(polygon * 2**IMAGE.sub_pixel_bits).astype(np.int32)], 1, shift=IMAGE.sub_pixel_bits)
     return torch.from_numpy(side > 0)
 
 

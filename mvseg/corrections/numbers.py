@@ -21,7 +21,6 @@ class EditNumbers:
     least_halves: int = 2  # chosen: photos that show two instances, from which a link between them may be about both
     touches: float = 0.02  # chosen: distance of the surfaces of two halves, in lengths of the first
     as_near: float = 1.1  # chosen: max. distance of the outline of one surface that fits as well as two, in theirs
-    fine: int = 4  # limit: bits of a pixel's fraction, along a cut
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
     around: float = 0.35  # chosen: margin around the rough outline that is part of it, as a share of its size
     least_margin_px: float = 4.0  # chosen: the same in pixels of the photo, at least

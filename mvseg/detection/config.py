@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mvseg.detection.numbers import DETECTION
+from mvseg.detectors import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE
 from mvseg.errors import check_choices, check_ranges
 
 
@@ -41,6 +42,5 @@ class DetectConfig:
 
     def __post_init__(self) -> None:
         check_choices(self, "detect")
-        sizes = DETECTION.min_image_size, DETECTION.max_image_size
-        check_ranges(self, "detect", min_score=(0, 1), min_probability=(0, 1), image_size=sizes)
-        check_ranges(self, "detect", num_iterations=(0, math.inf))
+        check_ranges(self, "detect", min_score=(0, 1), min_probability=(0, 1), num_iterations=(0, math.inf))
+        check_ranges(self, "detect", image_size=(MIN_IMAGE_SIZE, MAX_IMAGE_SIZE))

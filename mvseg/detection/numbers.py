@@ -12,8 +12,6 @@ from dataclasses import dataclass
 class DetectionNumbers:
     """Proposals of a detector, in all views at once."""
 
-    min_image_size: int = 32  # limit: longer side of a photo for the detector, as in a file of weights
-    max_image_size: int = 16_384  # limit: the same, at most
     size_step: float = 0.5**0.5  # chosen: size of a look, as a share of the one before: half of the pixels
     # Of two muskmelons of three, eight of 20 views find the best size, in a third of the time (docs/notes/detector.md).
     judging_views: int = 8  # chosen: views that choose the size, where there are twice as many or more

@@ -16,10 +16,10 @@ import torch
 from safetensors import safe_open
 from torch import Tensor, nn
 
+from mvseg.detectors import MAX_IMAGE_SIZE, MIN_IMAGE_SIZE
 from mvseg.errors import InputError
 
 DETECTOR_FILE = "detector.safetensors"  # in a result folder: the weights that have learned its plant
-MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # limit: pixels that photos are scaled to
 
 
 @dataclass(frozen=True)

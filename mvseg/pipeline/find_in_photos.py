@@ -19,6 +19,7 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.crops import plant_boxes
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.numbers import DETECTION
+from mvseg.detectors import MIN_IMAGE_SIZE
 from mvseg.errors import collect_warnings, warn
 from mvseg.findings.finding import Finding
 from mvseg.pipeline.open_scene import Opened
@@ -95,7 +96,7 @@ def choose_size(see: Callable[[int], Plant], first: Plant) -> list[Plant]:
         first: the pass at the usual size.
     """
     results, size, num_misses = [first], float(first.image_size), 0
-    while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
+    while (size := size * DETECTION.size_step) >= MIN_IMAGE_SIZE:
         best = order_sizes(results)[0]
         results.append(see(round(size)))
         num_misses = 0 if order_sizes(results)[0] is results[-1] else num_misses + 1
@@ -108,7 +109,7 @@ def choose_near(see: Callable[[int], Plant], size: int, *, most: int) -> list[Pl
     """Look once at a size, once at a larger and once at a smaller one: with weights that have learned at that size.
     `most`: the longer side of the photos, pixels. Returns as `choose_size`."""
     larger, smaller = min(round(size / DETECTION.size_step), most), round(size * DETECTION.size_step)
-    sizes = [size, *(each for each in (larger, smaller) if each > size or DETECTION.min_image_size <= each < size)]
+    sizes = [size, *(each for each in (larger, smaller) if each > size or MIN_IMAGE_SIZE <= each < size)]
     return order_sizes([see(each) for each in sizes])
 
 

@@ -19,7 +19,7 @@ class RayNumbers:
     same: float = math.radians(1.0)  # limit: angle between directions below which they crowd each other no more
     repeated: float = math.radians(0.25)  # chosen: angle below which views are of one place, as those of a burst
     parallel: float = math.radians(2.0)  # chosen: RMS of axes' angles to their mean, where they meet in no point
-    tie: float = 1e-6  # limit: difference of equal sums, as a share; the first one is taken
+    tie: float = 1e-6  # limit: difference of equal sums, lengths or distances, as a share; the first one is taken
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,6 @@ class StartNumbers:
     turns_deg: tuple[float, ...] = (0.0, 90.0, 45.0, 135.0)  # chosen: angles about the midrib of the starts' sides
     # Masks of a pixel have flat hulls, or hulls of a few voxels.
     thinnest: float = 0.01  # limit: min. width of a start in its lengths, and length in deviations of the cloud
-    tie: float = 1e-6  # limit: difference of equal lengths or distances, by rounding; the first one is taken
     flat: float = 1e-3  # chosen: part of a direction out of the cameras' plane, up to which a leaf lies in it
 
 
@@ -238,7 +237,7 @@ class StemNumbers:
 class AxisNumbers:
     """The axis that leaves point back to, in lengths of the leaf, or of the median leaf."""
 
-    least_leaves: int = 3  # limit: leaves that tell an axis
+    least_leaves: int = 3  # limit: leaves that tell an axis, or are joined by paths of thin parts
     least_of_many: int = 4  # chosen: leaves that tell one of several axes
     most_pairs: int = 200  # limit: pairs of ends of leaves through which lines are tried
     most_starts: int = 3  # limit: of all lines that are tried, those that a fit starts from
@@ -261,8 +260,7 @@ class AxisNumbers:
     beyond: float = 0.25  # chosen: by how much an axis goes on beyond its nodes, in its lengths
     points: int = 40  # limit: points of an axis
     ray_steps: int = 17  # limit: points of a ray, and again between two of these
-    rounds: int = 14  # limit: rounds of fitting the axis
-    straight_rounds: int = 7  # limit: of these, with a straight one
+    rounds: int = 14  # limit: rounds of fitting the axis, a straight one in the first half
 
 
 @dataclass(frozen=True)
@@ -292,7 +290,6 @@ class ThinNumbers:
     doubt_cost: float = 4.0  # chosen: cost of a cell that no view shows, in that of a sure one
     touch_cells: float = 8.0  # chosen: max. distance between a leaf and the cell where its petiole ends
     touch_cost: float = 30.0  # chosen: cost of entering or leaving a leaf: paths do not run through leaves
-    least_leaves: int = 3  # limit: min. leaves that are joined
     least_steps: int = 6  # chosen: min. cells of a line
     line_ends: int = 60  # limit: cells of which any two are tried as points of the line of a stem
     line_cells: float = 2.0  # chosen: distance from the line that has half the weight of none, in cells

@@ -29,6 +29,7 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import BAR, FAMILY, Shape, list_shapes, tag_corners
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.poses.alignment import align
+from mvseg.reconstruction.numbers import IMAGE
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.results.plant_files import METRES
 from mvseg.results.result import Result
@@ -247,5 +248,5 @@ def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool
 
 def _fill(polygon: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
     filled = np.zeros(size, np.uint8)
-    corners = np.round((polygon - 0.5) * (1 << IMAGES.shift)).astype(np.int32)
-    return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=IMAGES.shift), bool)
+    corners = np.round((polygon - 0.5) * (1 << IMAGE.sub_pixel_bits)).astype(np.int32)
+    return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=IMAGE.sub_pixel_bits), bool)

@@ -20,7 +20,6 @@ from torchvision.ops import masks_to_boxes
 from torchvision.transforms import v2
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
-from mvseg.simulation.skins import list_skins
 from mvseg.training.config import Orientation, TrainConfig
 from mvseg.training.data import SampleList, read_sample
 from mvseg.training.new_plants import draw_background, list_backgrounds, recolor, render_new_plant
@@ -43,7 +42,6 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         self.samples = samples
         self.config = config
         self.backgrounds = list_backgrounds(config.backgrounds)
-        self.skins = list_skins(config.skins)
 
     def __len__(self) -> int:
         return len(self.samples) + self.config.new_plants
@@ -54,7 +52,7 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         if index < len(self.samples):
             labelled = read_sample(self.samples.samples[index])
         else:
-            labelled = render_new_plant(seed, config.image_size, self.backgrounds, self.skins)
+            labelled = render_new_plant(seed, config.image_size, self.backgrounds)
             config = replace(config, orientation="fixed", scale_range=(1.0, 1.0), recolor=False)
         return *augment(labelled, config, seed, backgrounds=self.backgrounds), index
 

@@ -18,7 +18,7 @@ Orientation = Literal["any", "upright", "fixed"]
 
 # These may differ when a run is resumed: they do not change what is computed. (The names of the samples are compared
 # separately, so the data may have moved.)
-FREE_ON_RESUME = {"photos", "labels", "from_results", "val_photos", "val_labels", "backgrounds", "skins",
+FREE_ON_RESUME = {"photos", "labels", "from_results", "val_photos", "val_labels", "backgrounds",
                   "skip_broken", "skip_unlabelled", "output", "resume", "device", "num_workers",
                   "checkpoint_every", "log_every"}  # fmt: skip
 
@@ -66,8 +66,6 @@ class TrainConfig:
         new_plants: number of photos of simulated plants that each epoch adds to `photos`, rendered during the run,
             never the same twice (`pip install mvseg[simulate]`); they are neither scaled nor rotated.
         backgrounds: folder of photos without leaves, to be seen behind new plants and behind recoloured leaves.
-        skins: folder of single real leaves, cut out (PNG with an alpha channel): new plants get their skins, markings
-            and colours other than green.
         recolor: give the leaves of `photos` a colour and a background: for photos without colour, such as fluorescence.
         epochs: passes over the training samples; each ends with an evaluation.
         batch_size: samples per optimisation step, over all processes.
@@ -117,7 +115,6 @@ class TrainConfig:
     tint_probability: float = 0.0
     new_plants: int = 0
     backgrounds: Path | None = None
-    skins: Path | None = None
     recolor: bool = False
     epochs: int = 20
     batch_size: int = 4

@@ -24,15 +24,12 @@ from mvseg.training.photo_faults import draw
 
 if TYPE_CHECKING:
     from mvseg.simulation.growth import SimulatedPlant
-    from mvseg.simulation.look import Floats
 
 BACKGROUND_PX = 768  # limit: longer side at which background photos are kept in memory
 MOST_LEAVES = 60  # limit: leaves of a simulated plant
 
 
-def render_new_plant(
-    seed: int, size: int, backgrounds: tuple[Path, ...] = (), skins: tuple[Floats, ...] = ()
-) -> LabelledPhoto:
+def render_new_plant(seed: int, size: int, backgrounds: tuple[Path, ...] = ()) -> LabelledPhoto:
     """Render one photo of a new plant: any family, 2 to 60 leaves (30 or more in one of four plants), three in five
     wild (see `make_wild`), from any side, from small in the photo to larger than it, some in front of a real photo.
 
@@ -40,7 +37,6 @@ def render_new_plant(
         seed: >= 0; the same arguments give the same photo, bit for bit, on one machine.
         size: S; the photo is S x S pixels.
         backgrounds: photos without leaves, to be seen behind a plant whose ground is taken away.
-        skins: as `list_skins` returns them; with them, two in three plants look like other species (see `dress`).
 
     Raises:
         InputError: a background that cannot be read.
@@ -50,7 +46,6 @@ def render_new_plant(
     from mvseg.simulation.growth import grow_plant
     from mvseg.simulation.ray_cast import build_stage, render_stage
     from mvseg.simulation.scene_writer import drop_small
-    from mvseg.simulation.skins import dress
     from mvseg.simulation.wild import make_wild
 
     rng = np.random.default_rng(seed)
@@ -62,8 +57,6 @@ def render_new_plant(
     if is_cut_out:
         plant = replace(plant, parts=tuple(part for part in plant.parts if part.material != "ground"))
     stage = build_stage(plant, seed=seed)
-    if skins:
-        stage = replace(stage, look=dress(stage.look, skins, np.random.default_rng([seed, len(skins)])))
     shot = render_stage(stage, place_camera(plant, size, rng), 0)
     rgb = shot.rgb
     if is_cut_out:

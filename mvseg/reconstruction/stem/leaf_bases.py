@@ -191,7 +191,7 @@ def _fit_axis(
         bases = choose_ends(first, second, curve)
         nodes, distances, along = project_bases(bases, curve)
         weight = 1 / (1 + (distances / (AXES.near * size)) ** 2)
-        degree = 1 if turn < AXES.straight_rounds or len(bases) < AXES.bent_leaves else 2
+        degree = 1 if turn < AXES.rounds // 2 or len(bases) < AXES.bent_leaves else 2
         chord = curve[-1] - curve[0]
         chord = chord / np.linalg.norm(chord)
         place = (nodes - curve[0]) @ chord

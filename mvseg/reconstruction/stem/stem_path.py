@@ -32,8 +32,8 @@ class StemPath:
 
 def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None:
     """Find the line of cells through which the cheapest paths between the `leaves` {leaf: (P, 3) points on its surface}
-    run. None where fewer than `THIN.least_leaves` leaves are joined, or their paths share no line."""
-    if len(cells.points) < THIN.least_steps or len(leaves) < THIN.least_leaves:
+    run. None where fewer than `AXES.least_leaves` leaves are joined, or their paths share no line."""
+    if len(cells.points) < THIN.least_steps or len(leaves) < AXES.least_leaves:
         return None
     graph, num_cells = _join_cells(cells, leaves), len(cells.points)
     places = np.arange(num_cells, num_cells + len(leaves))
@@ -41,7 +41,7 @@ def find_path(cells: ThinCells, leaves: Mapping[int, Floats]) -> StemPath | None
     cost = every[:, num_cells:]
     joined = np.isfinite(cost).sum(1)
     root = int(np.lexsort((np.where(np.isfinite(cost), cost, 0).sum(1), -joined))[0])
-    if joined[root] < THIN.least_leaves:
+    if joined[root] < AXES.least_leaves:
         return None
     points = _fit_line(cells, _find_trunk(before[root], num_cells))
     return None if points is None else StemPath(points, cells.size, _find_petioles(graph, cells, leaves, points))

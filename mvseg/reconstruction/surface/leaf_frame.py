@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from mvseg.arrays import Floats, Ints
-from mvseg.reconstruction.numbers import STARTS
+from mvseg.reconstruction.numbers import RAYS, STARTS
 from mvseg.scene import nearest_point
 
 
@@ -45,7 +45,7 @@ def find_axes(px_from_world: Floats, middle: Floats, areas: Ints) -> Floats:
 
 def _farthest(vectors: Floats) -> Floats | None:
     lengths = np.linalg.norm(vectors, axis=1)
-    index = int((lengths >= lengths.max() - STARTS.tie).argmax())
+    index = int((lengths >= lengths.max() - RAYS.tie).argmax())
     return vectors[index] / lengths[index] if lengths[index] > STARTS.flat else None
 
 
@@ -58,7 +58,7 @@ def find_quarters(px_from_world: Floats, middle: Floats, axes: Floats) -> Ints:
     # (S, 2, 3) the axes, as photos show them.
     shown = matrix[:, :2] - cam[:, :2, None] / cam[:, 2:, None] * matrix[:, 2:]
     lengths = np.linalg.norm(shown, axis=1)
-    longest = (lengths >= lengths.max(1, keepdims=True) * (1 - STARTS.tie)).argmax(1)
+    longest = (lengths >= lengths.max(1, keepdims=True) * (1 - RAYS.tie)).argmax(1)
     x, y = shown[np.arange(len(shown)), :, longest].T * np.sign(cam[:, 2])
     is_level = np.abs(x) >= np.abs(y)
     cosine, sine = np.where(is_level, np.sign(x), 0), np.where(is_level, 0, np.sign(y))

@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
 from mvseg.arrays import Floats
-from mvseg.reconstruction.numbers import STARTS
+from mvseg.reconstruction.numbers import RAYS, STARTS
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
     CURL,
@@ -65,7 +65,7 @@ def _geodesic_places(points: Floats) -> Floats:
     """(P,) distance from a far end of the cloud, over the nearest-neighbour graph; loose pieces are joined."""
     tree = cKDTree(points)
     reach = tree.query(points, k=min(STARTS.neighbours + 1, len(points)))[0][:, -1]
-    near = tree.query_ball_point(points, reach * (1 + STARTS.tie))  # of voxels that are equally near, all
+    near = tree.query_ball_point(points, reach * (1 + RAYS.tie))  # of voxels that are equally near, all
     rows, columns = np.repeat(np.arange(len(points)), [len(each) for each in near]), np.concatenate(near).astype(int)
     distance = np.maximum(np.linalg.norm(points[rows] - points[columns], axis=1), 1e-12)
     graph = csr_matrix((distance, (rows, columns)), (len(points), len(points)))
@@ -82,7 +82,7 @@ def _geodesic_places(points: Floats) -> Floats:
 
 
 def _first_largest(values: Floats) -> int:
-    return int((values >= values.max() * (1 - STARTS.tie)).argmax())
+    return int((values >= values.max() * (1 - RAYS.tie)).argmax())
 
 
 def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:

@@ -9,38 +9,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
 from mvseg.simulation.look import Floats, Look, Marking, hue_color
 
-ROWS, COLUMNS = 192, 65  # limit: texels of a skin along and across the leaf
-GAMMA = 2.2  # definition: of the photos that skins are cut from
+ROWS, COLUMNS = 192, 65  # texels of a skin along and across the leaf
+GAMMA = 2.2  # of the photos that skins are cut from
 
 
 def list_skins(folder: Path | None) -> tuple[Floats, ...]:
-    """The skins of a folder of cut-out leaves, PNG files with an alpha channel, in the order of their names; none
-    without a folder. Raises InputError: no such folder, one without PNG files, or a file that is not a cut-out."""
+    """The skins of a folder of cut-out leaves, in the order of their names; none without a folder."""
     if folder is None:
         return ()
-    paths = sorted(folder.glob("*.png"))
-    if not paths:
-        raise InputError(f"skins is {folder}, expected a folder of PNG files, each a leaf that was cut out")
-    skins = []
-    for path in paths:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        if image is None or image.ndim != 3 or image.shape[2] != 4 or image.dtype != np.uint8:
-            raise InputError(f"{path}: expected a PNG of 8 bits with an alpha channel")
-        if np.count_nonzero(image[..., 3] > 127) < 100:
-            raise InputError(f"{path}: no leaf in the alpha channel, expected at least 100 pixels")
-        skins.append(unroll_leaf(image[..., 2::-1].astype(np.uint8), image[..., 3] > 127))
-    return tuple(skins)
+    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in sorted(folder.glob("*.png"))]
+    leaves = [image for image in images if image is not None and image.shape[2:] == (4,) and image.dtype == np.uint8]
+    if not images or len(leaves) < len(images):
+        raise SystemExit(f"{folder}: expected PNG files of 8 bits with an alpha channel, each a leaf that was cut out")
+    return tuple(unroll_leaf(leaf[..., 2::-1].astype(np.uint8), leaf[..., 3] > 127) for leaf in leaves)
 
 
 def unroll_leaf(rgb: NDArray[np.uint8], mask: NDArray[np.bool_]) -> Floats:
-    """A cut-out leaf, `rgb` (H, W, 3) with `mask` (H, W), as a texture over `Leaf.uv`: (ROWS, COLUMNS, 3) linear RGB.
-
-    Its long axis becomes the first axis of the texture, and each row across it is stretched to the full width. Which
-    end of the leaf comes first is not known.
-    """
+    """Texture over `Leaf.uv`, (ROWS, COLUMNS, 3) linear RGB, of a cut-out leaf, `rgb` (H, W, 3) with `mask` (H, W).
+    Its long axis becomes the first axis, either end first, and each row across it is stretched to the full width."""
     y, x = np.nonzero(mask)
     points = np.stack([x, y], 1) + 0.5
     center = points.mean(0)
