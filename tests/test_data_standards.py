@@ -76,7 +76,6 @@ def traits(tmp_path: Path) -> Path:
 
 
 def test_the_tables_are_what_the_checklist_asks_for(traits: Path) -> None:
-    """As on the page, in a process of its own."""
     out = traits.with_name("out")
     words = [sys.executable, "-W", "error", str(RECIPE), "miappe", str(traits), str(out), "--factors", "treatment"]
     subprocess.run(words, cwd=RECIPE.parents[2], check=True)

@@ -124,7 +124,6 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor]) -> 
 
 
 def test_leaves_are_chosen_on_the_cpu(model: MaskRCNN, photos: list[Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
-    """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=5, verify=True)
 
     def choose(proposals: Masks, matched: dict[str, Masks], judges: Judges, **_: object) -> Leaves:

@@ -40,7 +40,6 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
 def test_the_code_for_r_runs(tmp_path: Path) -> None:
-    """On the tables of eight plants on four days."""
     numbers = [["scene", "plant", "time", "treatment", "leaf", "trait", "value", "sd", "unit", "method", "ontology"]]
     leaves = [["scene", "plant", "time", "treatment", "leaf", "area", "area_sd", "unit", "method", "quality"]]
     for plant in range(8):

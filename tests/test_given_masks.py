@@ -57,7 +57,6 @@ def test_surfaces_never_harm_ids_of_real_plants(name: str, shared_data: Path) ->
     ("family", "seed"), [("rosette", 1), *(pytest.param(*each, marks=pytest.mark.slow) for each in OTHERS)]
 )
 def test_surfaces_never_harm_ids_of_simulated_plants(family: str, seed: int) -> None:
-    """Masks of a faulty segmenter."""
     plant = grow_plant(family, 6, seed)
     cameras = arc_cameras(5, plant, span_deg=200, elevations_deg=(20, 50), width=120, height=120)
     true = visible_ids(plant, cameras)

@@ -120,8 +120,8 @@ def test_imports_go_one_way() -> None:
 
 
 # Lines of Python, at most; 34,000, 6,800 and 31,000 are where they are to go. CONTRIBUTING.md says what a change owes.
-BUDGET = {"mvseg": 37_160, "benchmarks": 6_515, "tests": 32_882}
-SLACK, MOST_CODE = 400, 21_308
+BUDGET = {"mvseg": 37_160, "benchmarks": 6_493, "tests": 32_881}
+SLACK, MOST_CODE = 400, 21_307
 
 
 @pytest.mark.parametrize("place", BUDGET)
@@ -146,7 +146,6 @@ def test_the_code_does_not_grow() -> None:
 
 
 def test_nobody_is_he() -> None:
-    """In code and in docs: the user."""
     pages = [path for place in ("mvseg", "benchmarks") for path in (ROOT / place).rglob("*.py")]
     pages += [*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")]
     assert {path.name for path in pages if re.search(r"\b(he|his|him)\b", path.read_text("utf-8"))} == set()
@@ -287,7 +286,7 @@ def test_numbers_of_a_room_stand_in_one_place() -> None:
     assert {module for module, names in heads.items() if names} == BESIDE
 
 
-MOST_NUMBERS, MOST_CHOSEN = 637, 329  # 550 and 200 are where they are to go
+MOST_NUMBERS, MOST_CHOSEN = 629, 329  # 550 and 200 are where they are to go
 WORDS = "definition", "limit", "fitted", "insensitive", "chosen"  # of numbers
 
 

@@ -117,7 +117,6 @@ def test_every_block_is_of_a_kind(page: Path) -> None:
 
 @of_kind("python", mark="")
 def test_python_runs(block: Block, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On less of the shipped plant."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(mvseg, "demo_scene", lambda: plant)
     exec(compile(block.text, str(block), "exec"), {"__name__": "snippet"})
@@ -150,7 +149,6 @@ def test_commands_are_understood(block: Block) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", sorted({block.page for block in RUN if block.kind == ""}), ids=lambda page: page.name)
 def test_commands_run(page: Path, desk: Path) -> None:
-    """All of a page, as they stand, one after the other."""
     commands = [words for block in RUN if (block.page, block.kind) == (page, "") for words in block.commands]
     for program, *words in commands:
         if program == "python" and words[0] == "-c":
@@ -182,5 +180,4 @@ def test_files_that_are_shown_are_read(block: Block, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("block", [block for block in BLOCKS if block.kind == "bash"], ids=str)
 def test_scripts_are_sound(block: Block) -> None:
-    """Whether or not they can run here."""
     subprocess.run(["bash", "-n"], input=block.text, text=True, check=True)

@@ -41,15 +41,13 @@ def main() -> None:
     wall, begun = time.perf_counter(), time.process_time()
     running.timed = measured  # before the stages take it from there
     import mvseg.pipeline.learn  # noqa: F401
-    from mvseg.config import RunConfig
-    from mvseg.runs.one_scene import run_one_scene
-    from mvseg.runs.request import RunRequest
+    from mvseg.cli import main as run
 
     STAGES["imports"] = [time.process_time() - begun, 0.0]
     with TemporaryDirectory() as place, warnings.catch_warnings(), redirect_stdout(sys.stderr):
         warnings.simplefilter("ignore")
         out = Path(place) / "result"
-        run_one_scene(RunRequest(args.scene, None, out, RunConfig()))
+        run(["infer", str(args.scene), "--out", str(out), "--num_workers", "1"])
         found = json.loads((out / "instances.json").read_text(encoding="utf-8"))["annotations"]
     print(json.dumps({"stages": STAGES, "wall": time.perf_counter() - wall, "found": found}))
 

@@ -111,7 +111,6 @@ def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
 
 
 def _beside_table(source: Path, path: str | None) -> Path | None:
-    """A path from a cell: in the table's own folder if there is such a file, otherwise unchanged."""
     if not path:
         return None
     return (source.parent / path).absolute() if (source.parent / path).is_file() else Path(path)

@@ -42,7 +42,6 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
 
 
 def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[tuple[int, ...]]:
-    """Split views in two for the best contrast, as often as it is good enough."""
     if len(members) >= 2 * AGREEMENT.smallest:
         order = members[_order(pairs, members)]
         cuts = [(order[:cut], order[cut:]) for cut in range(AGREEMENT.smallest, len(order) - AGREEMENT.smallest + 1)]
@@ -72,7 +71,6 @@ def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.in
 
 
 def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
-    """Whether epipolar lines miss in half of the pairs between two groups, but not within both."""
     of_groups = [_upper(pairs.offset, one), _upper(pairs.offset, other)]
     within = [np.nanmedian(offsets) for offsets in of_groups if not np.isnan(offsets).all()]
     return bool(np.nanmedian(_block(pairs.offset, one, other)) >= AGREEMENT.offset > min(within))

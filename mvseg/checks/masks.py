@@ -48,7 +48,6 @@ def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
 
 
 def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
-    """Masks with stray pixels, which make the search volume for the leaf's shape much too large."""
     longest = cameras.sizes.amax(1).tolist()
     views: set[int] = set()
     for index in range(len(regions)):

@@ -88,7 +88,6 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
 
 
 def _is_blank(content: PhotoContent) -> bool:
-    """Whether a photo has one colour all over. A dark photo of a plant has little contrast, too."""
     return content.contrast < max(IMAGES.rounding, min(IMAGES.blank, IMAGES.blank_share * content.level))
 
 

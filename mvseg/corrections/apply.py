@@ -289,7 +289,6 @@ def _ties_of_words(words: Sequence[tuple[str, int, Key]], place: Mapping[Key, in
 
 
 def _agreeing_links(edited: _Edited, place: Mapping[Key, int]) -> tuple[_Edited, Links]:
-    """The links that hold, of rows, see `keep_latest`."""
     ties = [each for each in edited.ties if each.one in place and each.other in place]
 
     def links_of(edits: Collection[int]) -> Links:

@@ -5,12 +5,10 @@ Where masks show a leaf in two halves in many photos, each half is an instance o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mvseg.corrections.corrected import Corrected
@@ -21,6 +19,8 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.joined_halves import shows_both, touch
+from mvseg.verification.numbers import CHOICE
 
 
 def link_halves(corrected: Corrected, ids: Tensor, cameras: Cameras) -> Corrected:
@@ -37,7 +37,7 @@ def link_halves(corrected: Corrected, ids: Tensor, cameras: Cameras) -> Correcte
         own = torch.where(ids == one, 1, torch.where(ids == other, 2, -1))
         is_pair = (own[:, None] == 1) & (own == 2) & (masks.view_index[:, None] == masks.view_index)
         halves = is_pair.nonzero()
-        if not 0 < one < other or len(masks.view_index[halves[:, 0]].unique()) < EDITS.least_halves:
+        if not 0 < one < other or len(masks.view_index[halves[:, 0]].unique()) < CHOICE.least_views:
             continue
         if are_one_leaf(masks.regions, own, cameras):
             more = Links(torch.cat((links.must, halves)), links.cannot)
@@ -49,25 +49,12 @@ def link_halves(corrected: Corrected, ids: Tensor, cameras: Cameras) -> Correcte
 
 def are_one_leaf(regions: Regions, ids: Tensor, cameras: Cameras) -> bool:
     """Whether the surfaces of the instances 1 and 2 of D regions, `ids` (D,) int64, touch, and one surface shows the
-    masks of both as well as their own do."""
-    parts = fit_surfaces(regions, ids, cameras)
-    if not all(each.exists for each in parts.values()):
+    masks of both as well as their own do, with an outline as near to them: the IoU alone would forgive a larger one."""
+    halves = fit_surfaces(regions, ids, cameras).values()
+    if not all(each.exists for each in halves) or not touch(*halves):
         return False
-    joint = fit_surfaces(regions, ids.clamp(max=1), cameras)[1]
-    return _touches(parts[1], parts[2]) and fits_as_well(joint, [parts[1], parts[2]])
-
-
-def _touches(one: LeafSurface, other: LeafSurface) -> bool:
-    points, tree = one.points().reshape(-1, 3).numpy(), cKDTree(other.points().reshape(-1, 3).numpy())
-    return float(tree.query(points)[0].min()) <= EDITS.touches * one.length
-
-
-def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
-    """Whether a joint surface is credible, its median IoU at least that of the worst part, and its outline as near to
-    the masks: the IoU alone would forgive a larger surface."""
-    worst = min(float(part.iou.median()) for part in parts)
-    farthest = max(_outline_px(part) for part in parts)
-    return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= EDITS.as_near * farthest
+    surface = fit_surfaces(regions, ids.clamp(max=1), cameras)[1]
+    return shows_both(surface, halves) and _outline_px(surface) <= EDITS.as_near * max(map(_outline_px, halves))
 
 
 def _outline_px(surface: LeafSurface) -> float:

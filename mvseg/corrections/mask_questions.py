@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import RejectedCandidate
 from mvseg.verification.evidence import Evidence, paint_view, see_instances
-from mvseg.verification.numbers import CHOICE, EVIDENCE
+from mvseg.verification.numbers import CHOICE, DRAWN, EVIDENCE
 
 Kind = Literal["place", "leaf", "half"]
 
@@ -82,7 +82,7 @@ def list_mask_questions(
             questions += _ask_absent(masks, absent, painted, view=view, evidence=evidence, usual=usual)
     questions += _ask_masks(masks, surfaces_of, num_views, size=size) + _ask_rejected(rejected, is_taken, usual=usual)
     if photos is not None:
-        questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=QUESTIONS.half * usual), usual=usual)
+        questions += _ask_unmasked(masks, find_unmasked(masks, photos, least_area=DRAWN.half * usual), usual=usual)
     is_settled, asked, queue = masks.is_edited.tolist(), set[tuple[str, int]](), []
     for each in sorted(questions, key=_order):
         if each.kind == "leaf" and each.region >= 0:
@@ -140,7 +140,7 @@ def _ask_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> l
     places, halves = [], defaultdict[int, dict[int, Unmasked]](dict)
     for part in sorted(parts, key=lambda one: (-one.area, one.view)):
         is_beside = part.row >= 0 and ids[part.row] > 0 and not drawn[part.row]
-        if is_beside and part.area >= QUESTIONS.half * areas[part.row]:
+        if is_beside and part.area >= DRAWN.half * areas[part.row]:
             halves[ids[part.row]].setdefault(part.view, part)
         if part.area >= usual:
             places.append(part)

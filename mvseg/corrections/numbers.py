@@ -18,13 +18,10 @@ class EditNumbers:
     most_places: int = 100  # limit: max. places of a link: each is held against each other
     covered: float = 0.5  # definition: share of a mask above which an outline that covers it replaces it
     most_covered: int = 3  # chosen: masks that an outline replaces silently: two stems make three pieces
-    least_halves: int = 2  # chosen: photos that show two instances, from which a link between them may be about both
-    touches: float = 0.02  # chosen: distance of the surfaces of two halves, in lengths of the first
     as_near: float = 1.1  # chosen: max. distance of the outline of one surface that fits as well as two, in theirs
     segmented_px: int = 480  # limit: longer side of the part of a photo in which a rough outline is refined
     around: float = 0.35  # chosen: margin around the rough outline that is part of it, as a share of its size
     least_margin_px: float = 4.0  # chosen: the same in pixels of the photo, at least
-    least_pixels: int = 16  # chosen: min. pixels of that part within the rough outline
     rounds: int = 5  # limit: rounds of GrabCut
     least_leaf: float = 0.05  # chosen: min. size of the leaf, as a share of the rough outline's pixels
     tolerance_px: float = 1.0  # chosen: max. distance of an outline from the edge that it follows
@@ -42,7 +39,6 @@ class QuestionNumbers:
     empty: float = 0.6  # chosen: share of that part outside of all masks from which the mask is missing
     similar: float = 0.4  # chosen: IoU of that part with another leaf's mask that may be the missing one
     least_chance: float = 0.1  # chosen: P from which a candidate that was not chosen is asked about
-    half: float = 0.5  # chosen: size of a place beside a mask, relative to it, that may be half a leaf
     least_halves: int = 3  # chosen: photos from which that is asked: one mask may as well touch another leaf
     most_places: int = 12  # limit: max. places that one question shows
     opening: int = 5  # chosen: min. width of a place, pixels of the picture: stems are thinner, and seams beside masks

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mvseg.arrays import Floats, Pixels
 from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
+from mvseg.verification.numbers import SNAP
 from mvseg.verification.snap_edges import cut_by_color
 
 
@@ -41,7 +42,7 @@ def refine_outline(photo: Pixels, rough: Floats) -> Floats:
     part = cv2.resize(photo[y1:y2, x1:x2], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     inside = np.zeros(part.shape[:2], np.uint8)
     cv2.fillPoly(inside, [np.round((rough - (x1, y1)) * scale - 0.5).astype(np.int32)], 1)
-    if inside.sum() < EDITS.least_pixels or inside.all():
+    if inside.sum() < SNAP.least_pixels or inside.all():
         raise InputError("the rough outline is too small or as large as the photo, expected one around a leaf")
     state = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
     grown = cut_by_color(part, state, rounds=EDITS.rounds).astype(np.uint8)

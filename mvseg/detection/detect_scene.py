@@ -121,7 +121,6 @@ def detect_scene(
 def _detect(
     proposer: Proposer, photos: Photos, boxes: Tensor | None, *, config: DetectConfig, cache: CachedDetections | None
 ) -> Pass:
-    """One pass over every photo, or its box (V, 4) xyxy."""
     every, scene = [], photos.scene
     device = next(proposer.detector.parameters()).device
     made_by = "" if cache is None else describe_detector(config, proposer, str(device.type))

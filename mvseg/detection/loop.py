@@ -83,7 +83,6 @@ def _count_instances(masks: Masks) -> dict[int, int]:
 def _suppress(
     proposals: Masks, boxes: Tensor, iou_threshold: float, groups: Tensor, *, detections_per_view: int
 ) -> Tensor:
-    """NMS by group, then the limit of detections per view, as torchvision has it."""
     keep = cluster_aware_nms(boxes, proposals.detection_scores, groups, iou_threshold)
     view = proposals.view_index[keep]
     earlier = (view[:, None] == view).tril(-1).sum(1)

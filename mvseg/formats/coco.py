@@ -150,7 +150,6 @@ def read_files(parts: Sequence[Path], scene: PhotoSet) -> CocoFile:
 
 
 def _read_file(path: Path, scene: PhotoSet) -> CocoFile:
-    """The file; a list of results gets the images that it refers to."""
     content = load_json(path)
     if not isinstance(content, list):
         return check_content(path, content, CocoFile, expected="COCO")

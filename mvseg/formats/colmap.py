@@ -42,7 +42,6 @@ def find_colmap_model(folder: Path) -> Path | None:
 
 
 def _count_photos(model: Path) -> int:
-    """Number of photos that a model registers, without reading it; 0 if unknown."""
     with suppress(OSError, struct.error):
         if (model / "images.bin").is_file():
             with (model / "images.bin").open("rb") as file:

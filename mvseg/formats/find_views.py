@@ -107,7 +107,6 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def _exact_views(names: Sequence[str], scene: PhotoSet, in_source: str) -> list[int | None]:
-    """The view of each name by its path or its name, None if neither matches."""
     by_name = {composed(view.name): index for index, view in enumerate(scene.views)}
     by_path: dict[str, list[int]] = defaultdict(list)
     for index, view in enumerate(scene.views):

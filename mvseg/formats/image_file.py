@@ -108,7 +108,6 @@ def _is_turned_by_decoder(image: ImageFile) -> bool:
 
 
 def _turn_back(image: ImageFile, turn: int) -> Image.Image:
-    """A decoded image that has been turned, as the file stores it."""
     image.getexif()[ORIENTATION] = BACK.get(turn, turn)
     if not isinstance(image, TiffImageFile):
         return ImageOps.exif_transpose(image)
@@ -140,7 +139,6 @@ def _any_fault() -> Iterator[None]:
 
 
 def _find_reader(file: IO[bytes]) -> Callable[[IO[bytes]], ImageFile]:
-    """The reader of an open file, by its first bytes; the file stays at its start."""
     start = file.read(16)
     file.seek(0)
     if start[4:8] == b"ftyp" and start[8:12] in BRANDS:

@@ -74,7 +74,6 @@ def distort(image: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> n
 
 
 def _look_up(image: np.ndarray, lens: pycolmap.Camera, K: np.ndarray, *, mapping: Mapping) -> np.ndarray:
-    """The image at the positions that a mapping gives; outside of it, 0."""
     params, flat, size = tuple(lens.params), tuple(map(float, K.ravel())), (image.shape[1], image.shape[0])
     columns, rows = _positions(model=lens.model_name, params=params, K=flat, size=size, mapping=mapping)
     interpolation = cv2.INTER_NEAREST if image.ndim == 2 else cv2.INTER_LINEAR

@@ -140,7 +140,6 @@ def _read_offset(sensor: ElementTree.Element | None) -> np.ndarray:
 
 
 def _photo(folder: Path, label: str, sensor: ElementTree.Element | None, *, R: np.ndarray, center: np.ndarray) -> Photo:
-    """A photo whose camera has the rotation world_from_cam, `R`, and stands at `center`."""
     if sensor is None:
         raise InputError("its sensor is not in the file")
     width, height, values = _read_sensor(sensor)

@@ -86,7 +86,6 @@ def _by_photo(path: Path, rows: Rows, columns: Sequence[Any], *, what: str) -> d
 
 
 def _read_number(value: Any, where: str) -> float:
-    """A number of moderate size; InputError, which begins with `where`, if it is none."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -189,7 +189,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:
-    """torchvision's result dicts of matched masks, best score first."""
     results = []
     for view, (width, height) in enumerate(sizes):
         in_view = masks.select(masks.view_index == view)

@@ -22,8 +22,9 @@ from mvseg.pipeline.open_scene import Opened
 from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
 from mvseg.scene import Scene
 from mvseg.system.running import timed
-from mvseg.verification.candidates import Key
+from mvseg.verification.candidates import JOINED, Key
 from mvseg.verification.choose import Edited, RejectedCandidate, add_beside, choose_leaves, find_again
+from mvseg.verification.joined_halves import join_halves
 from mvseg.verification.leaf_color import colored_shares
 from mvseg.verification.leaf_scores import Rating, rate_pass
 from mvseg.verification.picture import colors_of_leaves
@@ -123,6 +124,19 @@ class Plant:
         chosen = replace(self, instances=instances, rejected=leaves.rejected, agreement=leaves.agreement)
         return replace(chosen, keys=leaves.keys).with_masks(leaves.masks)
 
+    def add_joined(self) -> Plant:
+        """Choose once more, where leaves are halves of one: the joined ones are candidates, too, see `join_halves`."""
+        judges = self.opened.judges
+        with timed("choose"):
+            joined = None if judges.photos is None else join_halves(self.masks, judges.photos, judges.fit)
+        if joined is None:
+            return self
+        is_new = joined.proposal < 0
+        rows = joined.proposal.where(~is_new, len(self.proposals) - 1 + is_new.cumsum(0))
+        proposals = Masks.concatenate((self.proposals, joined.select(is_new)))
+        matched = {**self.matched, JOINED: replace(joined, proposal=rows)}
+        return replace(self, proposals=proposals, matched=matched).choose()
+
 
 def match_given(opened: Opened) -> Plant:
     """The same id for given masks of the same leaf, see `match_masks`, and `choose_leaves`."""
@@ -152,7 +166,8 @@ def make_plant(opened: Opened, matching: Matching, detected: Pass | None = None)
         disagreement=opened.find_disagreement(matching),
     )
     tables = {name: source(plant, detected) for name, source in SOURCES.items()}
-    return replace(plant, matched={name: each for name, each in tables.items() if each is not None}).choose()
+    plant = replace(plant, matched={name: each for name, each in tables.items() if each is not None}).choose()
+    return plant.add_joined()
 
 
 def match_more(plant: Plant, detected: Pass | None) -> Masks | None:

@@ -217,7 +217,6 @@ def _read(video: cv2.VideoCapture, is_wanted: Callable[[int], bool]) -> Iterator
 
 
 def _aspect(video: cv2.VideoCapture) -> tuple[float, float]:
-    """Width and height of a pixel, as frames are turned; (1, 1) where the file does not say."""
     width, height = video.get(cv2.CAP_PROP_SAR_NUM), video.get(cv2.CAP_PROP_SAR_DEN)
     if width <= 0 or height <= 0:
         return 1.0, 1.0

@@ -60,7 +60,6 @@ def _directions(cameras: Cameras) -> NDArray[np.float64]:
 
 
 def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
-    """(V,) bool: the views that are left when the most crowded one goes, again and again."""
     chosen = np.ones(len(crowding), bool)
     load = crowding.sum(1)
     while chosen.sum() > most:

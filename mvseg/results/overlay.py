@@ -87,7 +87,6 @@ def find_thickest(mask: np.ndarray) -> tuple[tuple[int, int], float]:
 
 
 def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:
-    """Write numbers into a picture, smaller on small leaves."""
     ink = np.zeros(canvas.shape[:2], np.uint8)
     for text, (column, row), radius in numbers:
         own = float(np.clip(2 * radius / CAPITAL, max(0.35, 0.5 * scale), scale))

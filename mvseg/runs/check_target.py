@@ -161,7 +161,6 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
 
 
 def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
-    """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
     scene, on_page, seen = photos.scene, tag_corners(), find_scene_markers(photos, (FAMILY,))[FAMILY]
     sightings = {corner: places for corner, places in seen.items() if corner[0] in on_page}
     corners = triangulate_points(scene.cameras, sightings)

@@ -118,7 +118,6 @@ def _list_changes(folder: Path, record: RunRecord, scene: Scene, given: Sequence
 
 
 def _hash(path: Path) -> str:
-    """SHA-256 of an input, "" of one that has no end, or hardly."""
     try:
         return hash_files(path, most_bytes=MOST_BYTES)
     except OSError:
@@ -140,7 +139,6 @@ def _list_other_photos(folder: Path, record: RunRecord, scene: Scene) -> list[Fi
 
 
 def _flatten(options: Mapping[str, Any]) -> dict[str, Any]:
-    """{option: value}, those of stages as "match.seed"."""
     flat: dict[str, Any] = {}
     for stage, value in options.items():
         flat |= {f"{stage}.{name}": each for name, each in value.items()} if isinstance(value, dict) else {stage: value}

@@ -62,7 +62,6 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(places)
 
     def _answer(self, places: Mapping[str, Callable[[], bytes | Mapping[str, Any]]]) -> None:
-        """Send the page, or the JSON, that is asked for."""
         try:
             if (place := self._place()) not in places:
                 raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")

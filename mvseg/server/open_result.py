@@ -124,7 +124,6 @@ class OpenResult:
 
     @cached_property
     def _saved_page(self) -> tuple[Result, list[Picture]]:
-        """The whole result in the folder, and a picture of each view."""
         saved, views = self.saved_result, range(len(self.scene.views))
         return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
 

@@ -209,7 +209,6 @@ def _sync_files(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Let the names in a folder reach the disk, where systems can do this."""
     with suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

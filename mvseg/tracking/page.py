@@ -109,7 +109,6 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
 
 
 def _describe_node(leaf: SeenLeaf, pose: Floats) -> dict[str, Any] | None:
-    """The place of a leaf on its stem on one date; azimuths as the pot stood on the first one."""
     if leaf.node is None or "node_height" not in leaf.numbers:
         return None
     height, azimuth = leaf.numbers["node_height"], leaf.numbers.get("node_azimuth")
@@ -119,7 +118,6 @@ def _describe_node(leaf: SeenLeaf, pose: Floats) -> dict[str, Any] | None:
 
 
 def _describe_plant(growth: Growth) -> dict[str, Any]:
-    """The plant's own numbers, as those of track 0."""
     numbers = [
         (trait, 0, row.date, number)
         for row in growth.plant
@@ -134,7 +132,6 @@ def _describe_plant(growth: Growth) -> dict[str, Any]:
 
 
 def _describe_numbers(numbers: Iterable[tuple[str, int, int, Number]]) -> dict[str, Any]:
-    """{trait: {unit, tracks: {track: [[date, value, sd], ...]}}}."""
     described: dict[str, dict[str, Any]] = {}
     for trait, track, date, number in numbers:
         of_trait = described.setdefault(trait, {"unit": number.unit, "tracks": {}})

@@ -57,7 +57,6 @@ def draw_pictures(result: Result, leaves: Collection[int], *, side: int) -> tupl
 
 
 def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A photo as stored, if it is still where the run found it, can be read, and has its size."""
     with suppress(InputError):
         photo = read_rgb(path) if path.is_file() else None
         return None if photo is None or photo.shape[:2] != shape else photo

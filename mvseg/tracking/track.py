@@ -167,7 +167,6 @@ def _without_stems(
 
 
 def _observations_of(links: Sequence[LeafLink], dates: Sequence[PlantOnDate]) -> tuple[Asked, Asked]:
-    """Pairs of rows of `Leaves` that are one leaf, in the order of time, and pairs that are not."""
     rows = {date.scene: (index, {date.leaves[n].leaf: k for k, n in enumerate(date.shaped)})
             for index, date in enumerate(dates)}  # fmt: skip
     if links and len(rows) < len(dates):

@@ -298,7 +298,6 @@ def _gap_evidence(gaps: Floats) -> float:
 
 
 def _pair_gaps(height: Floats, height_sd: Floats, first: int) -> float:
-    """Gaps of leaves in pairs; where `first` is 1, the lowest leaf is alone."""
     gaps = np.diff(height)
     is_within = (np.arange(len(gaps)) + first) % 2 == 0
     between = gaps[~is_within]

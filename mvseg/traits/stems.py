@@ -233,7 +233,6 @@ def _join_ends(axes: Mapping[int, StemAxis]) -> list[list[int]]:
 
 
 def _is_wider_at_an_end(axis: StemAxis) -> bool:
-    """Whether one end of a stem is far wider than the quarter at the other one."""
     first, last = np.array_split(axis.radius, 4)[0], np.array_split(axis.radius, 4)[3]
     return bool(first.max() > WIDER * np.median(last) or last.max() > WIDER * np.median(first))
 

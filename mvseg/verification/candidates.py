@@ -17,6 +17,7 @@ from mvseg.reconstruction.stem.slenderness import stem_chances
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.verification.numbers import CHOICE
 
+EDITED, JOINED = "edited", "joined"  # definition: sources of candidates: edits made them, or two halves
 Fit = Callable[[Masks], Mapping[int, LeafSurface]]
 Key = tuple[int, ...]  # of a candidate: the rows of its masks, which never move in the table of proposals
 

@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from mvseg.arrays import Bools, Floats, Ints
 from mvseg.masks import Masks, Origin
-from mvseg.verification.candidates import Candidates
+from mvseg.verification.candidates import EDITED, Candidates
 from mvseg.verification.evidence import Drawn, see
 from mvseg.verification.leaf_scores import (
     FITTED,
@@ -24,8 +24,6 @@ from mvseg.verification.leaf_scores import (
 )
 from mvseg.verification.mask_colors import MaskColors
 from mvseg.verification.numbers import CHOICE
-
-EDITED = "edited"  # definition: source of candidates that edits made
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,8 +28,8 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.surface_cache import Cache
 from mvseg.scene import Cameras
-from mvseg.verification.candidates import Candidates, Key, gather_candidates
-from mvseg.verification.choice import EDITED, Choice, Rows, choose
+from mvseg.verification.candidates import EDITED, JOINED, Candidates, Key, gather_candidates
+from mvseg.verification.choice import Choice, Rows, choose
 from mvseg.verification.evidence import Drawn, draw_views, median_parallax, see
 from mvseg.verification.leaf_scores import Pairs, show_chances
 from mvseg.verification.match_again import match_again
@@ -178,6 +178,7 @@ def choose_leaves(
     candidates = gather_candidates(matched, table, judges.fit if is_judged else None)
     views = draw_views(table.regions, candidates.surfaces, judges.cameras, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
+    terms.shows[:, find_halves(candidates, views)] = -np.inf
     if judges.holds:
         terms = _hold(terms, edited, candidates, table, row_of)
     chosen = choose(candidates, table, drawn=views, rows=terms, min_probability=judges.min_probability)
@@ -207,6 +208,17 @@ def _is_surrounded(matched: Masks, edited: Edited | None, cameras: Cameras) -> b
     if parallax < EVIDENCE.least_parallax:
         warn(Finding("leaves_seen_from_one_side", values={"degrees": parallax}))
     return parallax >= EVIDENCE.least_parallax
+
+
+def find_halves(candidates: Candidates, drawn: Sequence[Drawn]) -> Bools:
+    """(K,) the candidates that are part of a joined one, by `CHOICE.same`: it stands for them."""
+    is_member, is_joined = (~np.isnan(candidates.matched)).astype(float), candidates.source == JOINED
+    shared = np.zeros((len(candidates), len(candidates)))
+    for each in drawn:
+        own = is_member[each.rows]
+        shared += own.T @ (each.masks.T @ each.masks).toarray() @ own
+    is_part = (shared >= CHOICE.same * shared.diagonal()[:, None])[:, is_joined].any(1)
+    return np.asarray(is_part & ~is_joined & (candidates.source != EDITED))
 
 
 def _say(edited: Edited, candidates: Candidates, table: Masks, row_of: Tensor, drawn: Sequence[Drawn]) -> Rows:

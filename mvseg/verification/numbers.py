@@ -47,7 +47,7 @@ class DrawnNumbers:
 
     least_visible: float = 0.3  # chosen: unhidden fraction of a surface that a view sees openly; see `open_pixels`
     least_colored: float = 0.8  # chosen: min. fraction of the unhidden part that has the colour of leaves
-    half: float = 0.5  # definition: a mask shows half a leaf if it covers less of the surface's image
+    half: float = 0.5  # definition: a mask, or a place without one, that covers less may be half a leaf
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,19 @@ class SnapNumbers:
     least_pixels: int = 10  # limit: sure pixels of leaf, or background, at a moved edge; GrabCut needs five
 
 
+@dataclass(frozen=True)
+class HalvesNumbers:
+    """Two leaves that are halves of one (docs/notes/detector.md)."""
+
+    overlap: float = 0.08  # chosen: min. share of the smaller mask that both masks show, on average
+    touches: float = 0.1  # chosen: max. distance of the two surfaces, in widths of the narrower one
+    fits: float = 0.95  # chosen: min. IoU of one surface for both, relative to that of the worse half
+    edge: float = 1.3  # chosen: max. change of colours between the two, relative to that within them
+
+
 EVIDENCE = EvidenceNumbers()
 CHOICE = ChoiceNumbers()
 DRAWN = DrawnNumbers()
+HALVES = HalvesNumbers()
 COLORS = ColorNumbers()
 SNAP = SnapNumbers()

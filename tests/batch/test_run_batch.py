@@ -59,7 +59,6 @@ def arguments(scenes: Path, out: Path, *more: str) -> list[str]:
 def test_a_broken_scene_does_not_stop_the_others(
     plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With real workers, on a terminal."""
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     out = tmp_path / "out"
     assert main(arguments(plants, out, "--num_workers", "2")) == 3
@@ -184,7 +183,6 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
 
 @pytest.mark.slow
 def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
-    """Real processes: whichever has the first scene is killed, twice."""
     if not Path("/proc/self/status").exists():
         pytest.skip("looks for the workers in /proc")
     out, killed = tmp_path / "out", []

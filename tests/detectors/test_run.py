@@ -76,7 +76,6 @@ def test_a_box_grows_where_its_mask_touches_it() -> None:
 
 @torch.no_grad()
 def test_the_mask_head_looks_again_in_boxes_that_grow(model: torch.nn.Module, photo: Tensor) -> None:
-    """Against the plain run, box by box."""
     model.roi_heads.nms_thresh = 1.0
     plain, found = (run_heads(model, photo, num_growths=number) for number in (0, 1))
     width, height = plain["frame"].tolist()

@@ -302,7 +302,6 @@ def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene,
 def test_soft_affinity_is_symmetric_and_favours_the_truth(
     views: int, balls: BallScene, sweep: PlaneSweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also where a few of many views tell it."""
     monkeypatch.setattr("mvseg.matching.nview.initialisation.EM", replace(EM, views=views))
     A = em_affinities(sweep)[-1]
     np.testing.assert_allclose(A, A.T)

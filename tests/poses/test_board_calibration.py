@@ -89,7 +89,6 @@ def height_above_table(camera: TableCamera, angles: np.ndarray) -> float:
 
 
 def test_two_cameras_share_axis_and_angles(top: list[np.ndarray]) -> None:
-    """Also angles that only one of them sees."""
     side = [draw_board(angle, pose=(SIDE_R, SIDE_T)) for angle in ANGLES]
     side[5] = side[6] = NOTHING
     found = calibrate_turntable({"top": [NOTHING, *top[1:]], "side": side}, BOARD)

@@ -47,7 +47,6 @@ def test_descriptors_have_one_length_and_no_more_are_kept_than_asked_for() -> No
 
 
 def test_alike_is_what_a_plain_count_says() -> None:
-    """And pictures of one thing are alike, those of others are not."""
     pictures = [rgb(0)[:300, :400], rgb(0)[60:360, 80:480], rgb(1)[:300, :400]]
     coarse = [coarsest(find_sift(picture, image_size=1000, most=4000)) for picture in pictures]
     assert all(len(each) == STRUCTURE.coarse for each in coarse)

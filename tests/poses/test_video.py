@@ -129,7 +129,6 @@ def test_frames_of_a_video_whose_pixels_are_not_square() -> None:
 
 @pytest.mark.parametrize("damage", ["cut short", "in the middle", "none"])
 def test_a_film_that_ends_early_is_said(tmp_path: Path, damage: str) -> None:
-    """Frames behind a damaged place that stand alone are read."""
     clip = write_clip(tmp_path / "walk.avi", pan(np.arange(40) * 3), codec="MJPG")
     data = bytearray(clip.read_bytes())
     if damage == "cut short":

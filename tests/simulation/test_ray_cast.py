@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -18,7 +16,6 @@ from mvseg.simulation.growth import SimulatedPlant, grow_plant
 from mvseg.simulation.look import draw_look
 from mvseg.simulation.pot import Part
 from mvseg.simulation.ray_cast import Rendering, build_stage, render_stage
-from mvseg.simulation.shading import leaf_color
 from rendered import render_view
 
 SIZE = 40
@@ -149,13 +146,3 @@ def test_shadow_of_a_leaf_darkens_the_soil() -> None:
     ground = np.where(shot.ids == 0, shot.rgb.mean(-1), np.nan)
     shade = ground[max(int(row) - 12, 0) : int(row) + 12, max(int(column) - 12, 0) : int(column) + 12]
     assert np.nanmin(shade) < 0.8 * np.nanmedian(ground)
-
-
-def test_leaves_show_their_skin_where_it_lies_on_the_blade() -> None:
-    look = replace(draw_look(np.random.default_rng(1)), leaf_spread=0.0, spots=-100.0)
-    skin = np.zeros((11, 5, 3), np.float32)
-    skin[..., 0], skin[..., 1] = np.linspace(0, 1, 11)[:, None], np.linspace(0, 1, 5)
-    uv = np.array([[0.0, -1.0], [0.5, 0.0], [1.0, 1.0], [0.25, 0.5]], np.float32)
-    albedo, _, _ = leaf_color(replace(look, skin=skin), np.ones(4, np.uint16), uv, dryness=np.zeros(4, np.float32))
-    assert np.allclose(albedo[:, 0], uv[:, 0], atol=1e-5)
-    assert np.allclose(albedo[:, 1], (uv[:, 1] + 1) / 2, atol=1e-5)

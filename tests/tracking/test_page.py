@@ -116,7 +116,6 @@ def test_the_page_in_a_browser(browser: sync_api.Browser, tmp_path: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 def test_growth_at_a_glance_on_a_phone(browser: sync_api.Browser, tmp_path: Path) -> None:
-    """Leaf 3 is new on the second date, leaf 1 gone."""
     tracks, photo = many_dates(2, 4), noisy_picture().jpeg
     state = {(1, 3): "born", (1, 1): "gone"}
     rows = tuple(

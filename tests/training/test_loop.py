@@ -103,7 +103,6 @@ def test_the_export_is_the_average_of_the_best_epoch(leaves: Path, finished: Pat
 
 
 def test_without_validation_the_last_epoch_is_exported(few: Path, tmp_path: Path) -> None:
-    """And the caller's generator is left alone."""
     before = torch.get_rng_state()
     train(make_config(few, tmp_path, hold_out_every=0, ema_decay=0.0, optimizer="sgd"), build_tiny())
     assert torch.equal(torch.get_rng_state(), before)

@@ -197,7 +197,6 @@ def test_of_two_stems_in_one_pot_the_one_that_is_shown_tells_no_up() -> None:
 
 
 def test_masks_of_stems_tell_better_than_leaves() -> None:
-    """Upwards, with a radius, and heights from the foot."""
     cameras = ring_cameras(10)
     axis = StemAxis(BENT, 0.06 + 0 * T)
     leaves = {}

@@ -336,7 +336,6 @@ def test_a_stem_among_leaves_is_not_chosen(half_widths: tuple[float, ...]) -> No
 
 
 def test_the_best_expected_f1() -> None:
-    """Against all thresholds, plainly."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         chances = rng.random(rng.integers(1, 12)).round(3)

@@ -109,7 +109,6 @@ def _ids(num_masks: int, id_of: Mapping[int, int]) -> np.ndarray:
 
 
 def _read(view: Any, size: tuple[int, ...] | None) -> ViewMasks:
-    """The masks of one view, numbered from 1, or its labels."""
     if isinstance(view, Mapping) and "masks" in view:
         stack = list(_stack(_to_numpy(view["masks"])))
     elif isinstance(view, (np.ndarray, Tensor)):

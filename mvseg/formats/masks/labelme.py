@@ -88,7 +88,6 @@ def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
 
 
 def _paste(text: str, points: np.ndarray, *, width: int, height: int) -> np.ndarray:
-    """A mask as a base64 PNG; its first point is the pixel of the top-left corner."""
     try:
         with PngImageFile(BytesIO(base64.b64decode(text, validate=True))) as image:
             if image.width > width or image.height > height:

@@ -167,7 +167,6 @@ def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> File
 
 
 def _name_kind(kind: str, files: Files) -> str:
-    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
     if kind == "YOLO" and has_tracks(path for paths in files for path in paths):
         return YOLO_TRACKS
     if kind != "JSON":

@@ -101,7 +101,6 @@ def fit_patches(
 
 
 def _to_unit_worlds(masks: MaskStack, starts: Floats) -> tuple[MaskStack, Floats]:
-    """Masks and coefficients (L, 26, 3) in worlds moved and scaled to each patch."""
     centres, scales = starts[:, MIDRIB].mean(1), measure_patch(starts).length
     coefficients = starts.copy()
     coefficients[:, MIDRIB] -= centres[:, None]
@@ -109,7 +108,6 @@ def _to_unit_worlds(masks: MaskStack, starts: Floats) -> tuple[MaskStack, Floats
 
 
 def _from_unit_worlds(coefficients: Floats, starts: Floats) -> Floats:
-    """Coefficients (L, 26, 3) in the world of the patches that the unit worlds were made for."""
     coefficients = coefficients * measure_patch(starts).length[:, None, None]
     coefficients[:, MIDRIB] += starts[:, MIDRIB].mean(1)[:, None]
     return coefficients
@@ -161,7 +159,6 @@ def invert_normal(matrix: Floats) -> Floats:
 
 
 def _weigh(distances: Distances, masks: MaskStack, offsets: Floats, *, scale_px: float) -> _Equations:
-    """Robust weights, after the offset of each view's masks (S,) is taken off."""
     px, leaf = distances.px - offsets[distances.stack], distances.leaf
     spread = np.nan_to_num(per_view(np.abs(px), leaf, distances.num_leaves))
     scale = np.maximum(scale_px, FIT.scale_factor * spread)

@@ -134,7 +134,6 @@ def _fit_new(
     fit: Callable[[Sequence[Any]], list[Any]],
     workers: Workers,
 ) -> None:
-    """Fit the leaves that the cache lacks, `SEARCH.at_once` at a time."""
     new = {name: each for name, each in asked.items() if name not in cache}
     leaves, rest = [*new.values()], range(0, len(new), SEARCH.at_once)
     answers = chain.from_iterable(map_in_order(fit, (leaves[n : n + SEARCH.at_once] for n in rest), workers))

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mvseg.arrays import Floats
@@ -185,6 +186,11 @@ class LeafSurface:
         """(3,) unit mean normal of the mesh, weighted by area."""
         mean = cell_normals(self.points().numpy()).sum((0, 1))
         return torch.from_numpy(mean / max(float(np.linalg.norm(mean)), 1e-300))
+
+    def distance_to(self, other: LeafSurface) -> float:
+        """Distance between the nearest points of both."""
+        points, tree = self.points().reshape(-1, 3).numpy(), cKDTree(other.points().reshape(-1, 3).numpy())
+        return float(tree.query(points)[0].min())
 
     def mesh(self, num_rows: int = 0, num_columns: int = 0) -> trimesh.Trimesh:
         """Open mesh of `points`, whose first vertex is the base and whose last one is the tip; empty without a surface.

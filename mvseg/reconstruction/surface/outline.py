@@ -60,7 +60,6 @@ def outline_samples(
 
 
 def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
-    """All points of the rim: down one side of the grid and up the other."""
     place, inner = _rim_places(*grid.shape)
     num_views, count = len(projection.px), len(place)
     flat = projection.px.reshape(num_views, -1, 2)

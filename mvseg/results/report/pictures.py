@@ -137,5 +137,4 @@ def trace_mask(mask: NDArray[np.uint8], corner: NDArray[np.int64], *, box: Box) 
 
 
 def _place(xy: NDArray[Any], box: Box) -> NDArray[np.float64]:
-    """Pixel positions (..., 2) of the photo, in units of the picture."""
     return np.asarray((xy - np.array(box[:2])) * UNITS / (box[2] - box[0]), dtype=np.float64)

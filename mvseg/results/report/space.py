@@ -21,13 +21,13 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.result import Result
 from mvseg.results.stem_shapes import StemPart, parts_of
 from mvseg.scene import Cameras, Scene, nearest_point
+from mvseg.traits.stems import find_upward
 from mvseg.traits.up import level_frame
 
 MESH_SHAPE = (24, 9)  # limit: grid of a surface: 352 triangles
 VOXEL_FACES = 700  # limit: max. triangles of a leaf of voxels
 STEPS = 32767  # limit: steps of a coordinate from 0 to 1: 16 bits
 PLANT_SHARE = 0.25  # chosen: radius of a plant without shapes, as a share of the distance of its cameras
-LEVEL = 0.3  # chosen: length of the mean up vector of the cameras, from which it is used as that of the plant
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +92,8 @@ def small_meshes(result: Result) -> dict[int, trimesh.Trimesh]:
 def find_frame(scene: Scene, meshes: Mapping[int, trimesh.Trimesh]) -> Frame:
     """The frame around some meshes; without any, around the place that the cameras look at."""
     cameras = scene.cameras.to("cpu")
-    up = None if scene.up is None else np.array(scene.up)
-    if up is None:
-        seen = -cameras.R[:, 1].mean(0).numpy()
-        up = seen if np.linalg.norm(seen) > LEVEL else -cameras.R[:, 2].mean(0).numpy()
+    up = find_upward(cameras) if scene.up is None else np.array(scene.up)
+    up = -cameras.R[:, 2].mean(0).numpy() if up is None else up
     length = float(np.linalg.norm(up))
     east, north, upward = level_frame(tuple((up / length).tolist()) if length > 1e-9 else (0.0, 0.0, 1.0))
     rotation = np.stack([east, upward, -north])
