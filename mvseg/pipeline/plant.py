@@ -132,9 +132,9 @@ class Plant:
         if joined is None:
             return self
         is_new = joined.proposal < 0
-        rows = joined.proposal.where(~is_new, len(self.proposals) - 1 + is_new.cumsum(0))
+        joined = replace(joined, proposal=joined.proposal.where(~is_new, len(self.proposals) - 1 + is_new.cumsum(0)))
         proposals = Masks.concatenate((self.proposals, joined.select(is_new)))
-        matched = {**self.matched, JOINED: replace(joined, proposal=rows)}
+        matched = {**self.matched, JOINED: joined}
         return replace(self, proposals=proposals, matched=matched).choose()
 
 

@@ -84,10 +84,10 @@ def shows_both(surface: LeafSurface | None, halves: Iterable[LeafSurface]) -> bo
 def _join(masks: Masks, pair: Pair, both: Both) -> Masks:
     """The masks of both as those of one leaf, with an id of 1, and the scores of the likelier half where both are."""
     is_both = torch.isin(masks.view_index, torch.tensor([*both]))
-    leaf = masks.select((masks.instance_ids == pair[0]) | ((masks.instance_ids == pair[1]) & ~is_both))
+    rows = (masks.instance_ids == pair[0]) | ((masks.instance_ids == pair[1]) & ~is_both)
+    leaf, proposal = masks.select(rows), masks.proposal.where(~is_both, -1)[rows]
     views, placed = leaf.view_index.tolist(), leaf.regions.placed
     crops = [both[view][0].union(both[view][1]) if view in both else placed(row) for row, view in enumerate(views)]
-    proposal = leaf.proposal.where(~torch.isin(leaf.view_index, torch.tensor([*both])), -1)
     return replace(replace_crops(leaf, crops), instance_ids=torch.ones_like(proposal), proposal=proposal)
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,8 +14,10 @@ import torch
 from mvseg.crop import Crop
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.masks import Masks, Origin
+from mvseg.matching.match import match_masks
+from mvseg.pipeline.plant import Plant
 from mvseg.regions import stack_regions
-from mvseg.verification.choose import Judges, choose_leaves, fit_roughly
+from mvseg.verification.choose import Judges, fit_roughly
 from mvseg.verification.joined_halves import join_halves, share_edge
 from three_leaves import CAMERAS, halved_maps, true_maps
 
@@ -75,15 +79,17 @@ def test_edges_are_the_same_from_both_sides_and_grow_with_the_step() -> None:
     assert share_edge(one, regions.placed(int((regions.labels == 3).nonzero()[0])), photo(0)) == np.inf
 
 
-def test_a_joined_leaf_stands_for_its_halves() -> None:
-    """Its halves score as well, and are leaves to all views."""
+def test_a_joined_leaf_stands_for_its_halves_and_its_masks_are_proposals() -> None:
     masks = halves()
-    joined = join_halves(masks, photo, fit)
-    assert joined is not None
-    is_new = joined.proposal < 0
-    rows = joined.proposal.where(~is_new, len(masks) - 1 + is_new.cumsum(0))
-    sources = {"matched": masks, "joined": replace(joined, proposal=rows)}
-    leaves = choose_leaves(Masks.concatenate((masks, joined.select(is_new))), sources, Judges(CAMERAS))
-    assert leaves.masks.num_instances == 3
+    opened: Any = SimpleNamespace(judges=Judges(CAMERAS, photos=photo))
+    matching = match_masks(masks, CAMERAS).with_masks(masks)
+    plant = (
+        Plant(opened, matching, masks, matched={"matched": masks}, image_size=1, boxes=torch.zeros(6, 4))
+        .choose()
+        .add_joined()
+    )
+    assert plant.masks.num_instances == 3
+    assert plant.proposals.proposal.tolist() == [*range(len(masks) + 5)]  # five views show both halves
+    assert torch.equal(plant.choose().masks.proposal, plant.masks.proposal)
     whole = [np.where(labels == 11, 1, labels) for labels in HALVED]
-    assert leaf_metrics(leaves.masks.regions, leaves.masks.instance_ids, whole).mv_pq > 0.95
+    assert leaf_metrics(plant.masks.regions, plant.masks.instance_ids, whole).mv_pq > 0.95
