@@ -89,7 +89,6 @@ def test_all_are_taken_where_there_are_no_more_and_views_from_one_place_count_as
 
 
 def test_cameras_that_look_the_same_way_are_spread_over_their_places() -> None:
-    """As on a gantry, where axes have no common point."""
     ring = ring_cameras(9)
     R = ring.R[[0] * 9]
     across = torch.stack((torch.arange(9.0) % 3, torch.arange(9) // 3, torch.full((9,), 9.0)), 1).double()

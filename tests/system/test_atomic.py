@@ -259,7 +259,6 @@ def test_files_of_a_folder_are_all_old_or_all_new_wherever_a_process_is_killed(t
 
 @pytest.mark.parametrize("case", ["mark is a link", "linked folder", "link within", "mark is a file"])
 def test_marks_of_a_stranger_move_nothing(tmp_path: Path, case: str) -> None:
-    """Into a folder outside, or out of one."""
     place, mark, other = tmp_path / "out", tmp_path / ".out.mvseg-ready", tmp_path / "other"
     for folder in (place, other):
         folder.mkdir()

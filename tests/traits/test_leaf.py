@@ -36,7 +36,6 @@ def test_every_trait_is_measured_with_a_deviation() -> None:
 def test_deviations_are_those_of_leaves_measured_one_by_one(
     frame: np.ndarray | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Slow twin."""
     together, deviation = measure_leaf(bent_blade(), frame), LeafSurface.deviation
 
     def one_by_one(surface: LeafSurface, measure: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

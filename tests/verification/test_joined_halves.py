@@ -83,11 +83,8 @@ def test_a_joined_leaf_stands_for_its_halves_and_its_masks_are_proposals() -> No
     masks = halves()
     opened: Any = SimpleNamespace(judges=Judges(CAMERAS, photos=photo))
     matching = match_masks(masks, CAMERAS).with_masks(masks)
-    plant = (
-        Plant(opened, matching, masks, matched={"matched": masks}, image_size=1, boxes=torch.zeros(6, 4))
-        .choose()
-        .add_joined()
-    )
+    plant = Plant(opened, matching, masks, {"matched": masks}, image_size=1, boxes=torch.zeros(6, 4))
+    plant = plant.choose().add_joined()
     assert plant.masks.num_instances == 3
     assert plant.proposals.proposal.tolist() == [*range(len(masks) + 5)]  # five views show both halves
     assert torch.equal(plant.choose().masks.proposal, plant.masks.proposal)
