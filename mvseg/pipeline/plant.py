@@ -125,10 +125,10 @@ class Plant:
         return replace(chosen, keys=leaves.keys).with_masks(leaves.masks)
 
     def add_joined(self) -> Plant:
-        """Choose once more, where leaves are halves of one: the joined ones are candidates, too, see `join_halves`."""
-        judges = self.opened.judges
+        """Choose once more, where surfaces judge and leaves are halves of one: joined ones are candidates, too."""
+        photos, fit = self.opened.judges.photos if self.instances.starts else None, self.opened.judges.fit
         with timed("choose"):
-            joined = None if judges.photos is None else join_halves(self.masks, judges.photos, judges.fit)
+            joined = None if photos is None else join_halves(self.masks, photos, fit)
         if joined is None:
             return self
         is_new = joined.proposal < 0

@@ -92,7 +92,6 @@ def test_the_head_tells_the_size_and_the_bits(name: str, tmp_path: Path) -> None
 
 
 def test_a_film_behind_a_jpeg_does_no_harm_and_cmyk_keeps_its_colours(tmp_path: Path) -> None:
-    """As phones append it."""
     (tmp_path / "image.jpg").write_bytes(JPEGS["baseline"] + b"ftyp" * 50)
     np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg")[..., ::-1], cv2.imread(str(tmp_path / "image.jpg")))
     (tmp_path / "image.jpg").write_bytes(save("CMYK", "JPEG", quality=98))

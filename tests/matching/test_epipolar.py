@@ -102,7 +102,6 @@ def test_many_cameras_far_from_the_origin_keep_their_baselines() -> None:
 
 
 def test_histograms_of_very_many_pixels_count_in_wider_numbers() -> None:
-    """A mask of 40 megapixels in one bin."""
     weight = torch.full((10,), 4e6)
     angles, owner = torch.full((10,), 0.5), torch.zeros(10, dtype=torch.int64)
     bins = choose_bins((0.01, 0.01), (torch.tensor([0.0, 1.0]),) * 2)

@@ -17,6 +17,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.match import match_masks
 from mvseg.pipeline.plant import Plant
 from mvseg.regions import stack_regions
+from mvseg.results.result import Instances
 from mvseg.verification.choose import Judges, fit_roughly
 from mvseg.verification.joined_halves import join_halves, share_edge
 from three_leaves import CAMERAS, halved_maps, true_maps
@@ -88,5 +89,6 @@ def test_a_joined_leaf_stands_for_its_halves_and_its_masks_are_proposals() -> No
     assert plant.masks.num_instances == 3
     assert plant.proposals.proposal.tolist() == [*range(len(masks) + 5)]  # five views show both halves
     assert torch.equal(plant.choose().masks.proposal, plant.masks.proposal)
+    assert replace(plant, instances=Instances()).add_joined().matched is plant.matched  # surfaces do not judge
     whole = [np.where(labels == 11, 1, labels) for labels in HALVED]
     assert leaf_metrics(plant.masks.regions, plant.masks.instance_ids, whole).mv_pq > 0.95
