@@ -41,7 +41,7 @@ class Plant:
 
     Attributes:
         matching: D masks with their ids, and a report on the scene.
-        proposals: R masks on the CPU, the excessive set of the detector, or the given masks.
+        proposals: R masks on the CPU, the excessive set of the detector and joined halves, or the given masks.
         matched: {source of candidates: table of matched proposals}, see `SOURCES`.
         image_size: longer side of the photos, or of their parts, as the segmenter saw them; pixels.
         boxes: (V, 4) int64 xyxy, the parts of the photos that the segmenter saw.
@@ -134,8 +134,7 @@ class Plant:
         is_new = joined.proposal < 0
         joined = replace(joined, proposal=joined.proposal.where(~is_new, len(self.proposals) - 1 + is_new.cumsum(0)))
         proposals = Masks.concatenate((self.proposals, joined.select(is_new)))
-        matched = {**self.matched, JOINED: joined}
-        return replace(self, proposals=proposals, matched=matched).choose()
+        return replace(self, proposals=proposals, matched={**self.matched, JOINED: joined}).choose()
 
 
 def match_given(opened: Opened) -> Plant:
@@ -187,7 +186,7 @@ def match_freed(plant: Plant, _: Pass | None) -> Masks | None:
 
 
 # Each gives proposals with ids of their own. Instances that an earlier one has, by name, are not added again, so that
-# the order does not matter. The masks that "matched" gives are there without any other source; edits are one more.
+# the order does not matter. "matched" needs no other source; joined halves (`add_joined`) and edits are two more.
 SOURCES: dict[str, Callable[[Plant, Pass | None], Masks | None]] = {
     "matched": lambda plant, _: plant.masks,
     "matched again": match_freed,

@@ -178,7 +178,7 @@ def choose_leaves(
     candidates = gather_candidates(matched, table, judges.fit if is_judged else None)
     views = draw_views(table.regions, candidates.surfaces, judges.cameras, photos=judges.photos)
     terms = Rows.none(len(table), len(candidates)) if edited is None else _say(edited, candidates, table, row_of, views)
-    terms.shows[:, find_halves(candidates, views)] = -np.inf
+    terms = replace(terms, shows=np.where(find_halves(candidates, views), -np.inf, terms.shows))
     if judges.holds:
         terms = _hold(terms, edited, candidates, table, row_of)
     chosen = choose(candidates, table, drawn=views, rows=terms, min_probability=judges.min_probability)

@@ -8,6 +8,7 @@ them than within them.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -56,18 +57,18 @@ def join_halves(masks: Masks, photos: ReadPhoto, fit: Fit) -> Masks | None:
 
 
 def _overlapping(masks: Masks) -> dict[Pair, Both]:
-    """The pairs of leaves that overlap by `HALVES.overlap` or more, most first, with their masks in the views that show
-    both (two views or more)."""
-    ids, views = masks.instance_ids.tolist(), masks.view_index.tolist()
+    """Pairs of leaves that overlap by `HALVES.overlap` or more, most first, with their masks in views that show both."""
+    ids, views, areas = masks.instance_ids.tolist(), masks.view_index.tolist(), masks.regions.areas.tolist()
     placed = {(leaf, view): masks.regions.placed(row) for row, (leaf, view) in enumerate(zip(ids, views, strict=True))}
-    pairs, shares = dict[Pair, Both](), dict[Pair, float]()
-    for low, high in sorted({tuple(sorted((ids[one], ids[other]))) for one, other, _ in masks.regions.overlaps()}):
-        shown = [view for view in sorted({*views}) if {(low, view), (high, view)} <= {*placed}]
-        both = {view: (placed[low, view], placed[high, view]) for view in shown}
-        parts = [one.intersect(other).area / min(one.area, other.area) for one, other in both.values()]
-        if low > 0 and len(both) >= CHOICE.least_views and np.mean(parts) >= HALVES.overlap:
-            pairs[low, high], shares[low, high] = both, round(float(np.mean(parts)), CHOICE.digits)
-    return {pair: pairs[pair] for pair in sorted(pairs, key=lambda pair: -shares[pair])}
+    totals, pairs = defaultdict[Pair, float](float), list[tuple[float, Pair, Both]]()
+    for one, other, shared in masks.regions.overlaps():
+        totals[min(ids[one], ids[other]), max(ids[one], ids[other])] += shared / min(areas[one], areas[other])
+    for (low, high), total in totals.items():
+        shown = [view for view in sorted({*views}) if {(low, view), (high, view)} <= placed.keys()]
+        if low > 0 and len(shown) >= CHOICE.least_views and total >= HALVES.overlap * len(shown):
+            both = {view: (placed[low, view], placed[high, view]) for view in shown}
+            pairs.append((-round(total / len(shown), CHOICE.digits), (low, high), both))
+    return {pair: both for _, pair, both in sorted(pairs, key=lambda each: each[:2])}
 
 
 def touch(one: LeafSurface, other: LeafSurface) -> bool:
