@@ -57,7 +57,7 @@ def join_halves(masks: Masks, photos: ReadPhoto, fit: Fit) -> Masks | None:
 
 
 def _overlapping(masks: Masks) -> dict[Pair, Both]:
-    """Pairs of leaves that overlap by `HALVES.overlap` or more, most first, with their masks in views that show both."""
+    """Pairs of leaves that overlap by `HALVES.overlap` or more, most first; their masks in views that show both."""
     ids, views, areas = masks.instance_ids.tolist(), masks.view_index.tolist(), masks.regions.areas.tolist()
     placed = {(leaf, view): masks.regions.placed(row) for row, (leaf, view) in enumerate(zip(ids, views, strict=True))}
     totals, pairs = defaultdict[Pair, float](float), list[tuple[float, Pair, Both]]()
