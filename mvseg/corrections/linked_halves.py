@@ -54,7 +54,8 @@ def are_one_leaf(regions: Regions, ids: Tensor, cameras: Cameras) -> bool:
     if not all(each.exists for each in halves) or not touch(*halves):
         return False
     surface = fit_surfaces(regions, ids.clamp(max=1), cameras)[1]
-    return shows_both(surface, halves) and _outline_px(surface) <= EDITS.as_near * max(map(_outline_px, halves))
+    is_near = _outline_px(surface) <= EDITS.as_near * max(map(_outline_px, halves))
+    return surface.is_credible and shows_both(surface, halves, fits=1.0) and is_near
 
 
 def _outline_px(surface: LeafSurface) -> float:

@@ -73,13 +73,13 @@ def _overlapping(masks: Masks) -> dict[Pair, Both]:
 
 def touch(one: LeafSurface, other: LeafSurface) -> bool:
     """Whether the surfaces of two halves touch."""
-    return one.distance_to(other) <= HALVES.touches * min(one.width, other.width)
+    return one.distance_to(other) <= HALVES.touches * one.length
 
 
-def shows_both(surface: LeafSurface | None, halves: Iterable[LeafSurface]) -> bool:
-    """Whether one surface shows the masks of both halves as well as their own do."""
+def shows_both(surface: LeafSurface | None, halves: Iterable[LeafSurface], *, fits: float = HALVES.fits) -> bool:
+    """Whether one surface shows the masks of both halves by the IoU of the worse one, times `fits`."""
     worst = min(float(each.iou.nanmedian()) for each in halves)
-    return surface is not None and surface.exists and float(surface.iou.nanmedian()) >= HALVES.fits * worst
+    return surface is not None and surface.exists and float(surface.iou.nanmedian()) >= fits * worst
 
 
 def _join(masks: Masks, pair: Pair, both: Both) -> Masks:
@@ -118,9 +118,8 @@ def share_edge(one: Crop, other: Crop, photo: Pixels) -> float:
     way, way_other = (_depth(~each) - _depth(each) for each in (first, second))
     is_middle = (abs(way - way_other) <= band) & (np.maximum(way, way_other) <= reach) & (_depth(union) > band + 1)
     is_deep = np.maximum(_depth(first & ~second), _depth(second & ~first)) > band + 1
-    if not is_middle.any() or not is_deep.any():
-        return math.inf
-    return float(change[is_middle].mean() / max(change[is_deep].mean(), 1e-9))
+    is_told = is_middle.any() and is_deep.any()
+    return float(change[is_middle].mean() / max(change[is_deep].mean(), 1e-9)) if is_told else math.inf
 
 
 def _depth(is_inside: Bools) -> Floats:

@@ -79,7 +79,7 @@ class HalvesNumbers:
     """Two leaves that are halves of one (docs/notes/detector.md)."""
 
     overlap: float = 0.08  # chosen: min. share of the smaller mask that both masks show, on average
-    touches: float = 0.1  # chosen: max. distance of the two surfaces, in widths of the narrower one
+    touches: float = 0.02  # chosen: max. distance of the two surfaces, in lengths of the first
     fits: float = 0.95  # chosen: min. IoU of one surface for both, relative to that of the worse half
     edge: float = 1.3  # chosen: max. change of colours between the two, relative to that within them
 
